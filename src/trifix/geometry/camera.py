@@ -1,0 +1,189 @@
+"""Cameras and the pair of them: from space to pixels and back.
+
+Pixel (0, 0) is the centre of the top-left pixel, (u, v) = (column, row). Camera coordinates: x right, y down,
+z forward. Distortion models are Kalibr's: ``radtan`` (Brown 1966; k1, k2, p1, p2 and optionally k3, OpenCV's order)
+and ``equidistant`` (Kannala & Brandt 2006; k1..k4).
+"""
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from jaxtyping import Float
+
+from trifix.geometry.pose import Pose
+
+DistortionModel = Literal["none", "radtan", "equidistant"]
+
+
+@dataclass(frozen=True, slots=True)
+class Camera:
+    """One calibrated camera: a pinhole with distortion."""
+
+    fu_px: float
+    """Focal length along u (px)."""
+    fv_px: float
+    """Focal length along v (px)."""
+    pu_px: float
+    """Principal point, u (px)."""
+    pv_px: float
+    """Principal point, v (px)."""
+    width_px: int
+    """Columns of the image."""
+    height_px: int
+    """Rows of the image."""
+    model: DistortionModel = "none"
+    """Which distortion the coefficients belong to."""
+    coefficients: tuple[float, ...] = ()
+    """radtan: k1, k2, p1, p2[, k3]; equidistant: k1, k2, k3, k4; none: empty."""
+
+    @property
+    def K(self) -> Float[np.ndarray, "3 3"]:
+        """The matrix of intrinsics."""
+        return np.array([[self.fu_px, 0.0, self.pu_px], [0.0, self.fv_px, self.pv_px], [0.0, 0.0, 1.0]])
+
+    def project(self, xyz_mm: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 2"]:
+        """Pixels of points in this camera's coordinates; NaN for points not in front of it."""
+        z = np.where(xyz_mm[:, 2] > 0, xyz_mm[:, 2], np.nan)
+        xy = distort(self.model, self.coefficients, xyz_mm[:, :2] / z[:, None])
+        return xy * [self.fu_px, self.fv_px] + [self.pu_px, self.pv_px]
+
+    def project_jacobian(self, xyz_mm: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 2 3"]:
+        """d(u, v) / d(x, y, z) at points in front of the camera (px/mm)."""
+        z = xyz_mm[:, 2]
+        xy = xyz_mm[:, :2] / z[:, None]
+        J_xy = distort_jacobian(self.model, self.coefficients, xy)
+        J_pinhole = np.zeros((len(z), 2, 3))
+        J_pinhole[:, 0, 0] = J_pinhole[:, 1, 1] = 1 / z
+        J_pinhole[:, :, 2] = -xy / z[:, None]
+        return np.asarray(np.array([[self.fu_px], [self.fv_px]]) * (J_xy @ J_pinhole))
+
+    def unproject(self, uv_px: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n 2"]:
+        """Undistorted ray slopes (x/z, y/z) of pixels; NaN where the distortion model cannot be inverted."""
+        xy = (uv_px - [self.pu_px, self.pv_px]) / [self.fu_px, self.fv_px]
+        return undistort(self.model, self.coefficients, xy)
+
+    def unproject_jacobian(self, xy: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n 2 2"]:
+        """d(x/z, y/z) / d(u, v) at undistorted slopes, for carrying pixel covariances (1/px)."""
+        J = distort_jacobian(self.model, self.coefficients, xy) * np.array([[self.fu_px], [self.fv_px]])
+        return np.asarray(np.linalg.inv(J))
+
+    def sees(self, xyz_mm: Float[np.ndarray, "n 3"], margin_px: float = 0.0) -> np.ndarray:
+        """Which points (camera coordinates) fall on the image, at least ``margin_px`` inside its edge: (n,) bool."""
+        uv = self.project(xyz_mm)
+        with np.errstate(invalid="ignore"):
+            inside = (uv >= margin_px - 0.5) & (
+                uv <= [self.width_px - 0.5 - margin_px, self.height_px - 0.5 - margin_px]
+            )
+        return np.asarray(inside.all(axis=1))
+
+
+@dataclass(frozen=True, slots=True)
+class StereoRig:
+    """Two cameras held rigidly; sensor coordinates are those of the left one."""
+
+    left: Camera
+    """Camera 0."""
+    right: Camera
+    """Camera 1."""
+    T_right_left: Pose
+    """Coordinates in the right camera of what has coordinates in the left (mm)."""
+
+    @property
+    def baseline_mm(self) -> float:
+        """Distance between the centres of projection."""
+        return float(np.linalg.norm(self.T_right_left.t_mm))
+
+    @property
+    def right_centre_mm(self) -> Float[np.ndarray, "3"]:
+        """Centre of projection of the right camera, sensor coordinates."""
+        return self.T_right_left.inverse().t_mm
+
+
+def distort(
+    model: DistortionModel, coefficients: tuple[float, ...], xy: Float[np.ndarray, "n 2"]
+) -> Float[np.ndarray, "n 2"]:
+    """Distorted slopes of undistorted ones."""
+    if model == "none":
+        return np.asarray(xy, dtype=float)
+    x, y = xy[:, 0], xy[:, 1]
+    r2 = x * x + y * y
+    if model == "radtan":
+        k1, k2, p1, p2, k3 = (*coefficients, 0.0)[:5]
+        radial = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
+        return np.stack(
+            [
+                x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x),
+                y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y,
+            ],
+            axis=1,
+        )
+    k1, k2, k3, k4 = coefficients
+    r = np.sqrt(r2)
+    theta = np.arctan(r)
+    t2 = theta * theta
+    theta_d = theta * (1 + t2 * (k1 + t2 * (k2 + t2 * (k3 + t2 * k4))))
+    scale = np.where(r > 1e-9, theta_d / np.maximum(r, 1e-9), 1.0)
+    return np.asarray(xy * scale[:, None])
+
+
+def distort_jacobian(
+    model: DistortionModel, coefficients: tuple[float, ...], xy: Float[np.ndarray, "n 2"]
+) -> Float[np.ndarray, "n 2 2"]:
+    """d(distorted) / d(undistorted) slopes."""
+    J = np.zeros((len(xy), 2, 2))
+    if model == "none":
+        J[:, 0, 0] = J[:, 1, 1] = 1.0
+        return J
+    x, y = xy[:, 0], xy[:, 1]
+    r2 = x * x + y * y
+    if model == "radtan":
+        k1, k2, p1, p2, k3 = (*coefficients, 0.0)[:5]
+        radial = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
+        d_radial = k1 + r2 * (2 * k2 + 3 * r2 * k3)  # d radial / d r²
+        J[:, 0, 0] = radial + 2 * x * x * d_radial + 2 * p1 * y + 6 * p2 * x
+        J[:, 0, 1] = J[:, 1, 0] = 2 * x * y * d_radial + 2 * p1 * x + 2 * p2 * y
+        J[:, 1, 1] = radial + 2 * y * y * d_radial + 6 * p1 * y + 2 * p2 * x
+        return J
+    k1, k2, k3, k4 = coefficients
+    r = np.maximum(np.sqrt(r2), 1e-9)
+    theta = np.arctan(r)
+    t2 = theta * theta
+    theta_d = theta * (1 + t2 * (k1 + t2 * (k2 + t2 * (k3 + t2 * k4))))
+    d_theta_d = 1 + t2 * (3 * k1 + t2 * (5 * k2 + t2 * (7 * k3 + t2 * 9 * k4)))
+    scale = theta_d / r
+    slope = (d_theta_d / (1 + r2) - scale) / r2.clip(1e-18)  # (d scale / d r) / r
+    J[:, 0, 0] = scale + slope * x * x
+    J[:, 0, 1] = J[:, 1, 0] = slope * x * y
+    J[:, 1, 1] = scale + slope * y * y
+    return J
+
+
+def undistort(
+    model: DistortionModel, coefficients: tuple[float, ...], xy: Float[np.ndarray, "n 2"]
+) -> Float[np.ndarray, "n 2"]:
+    """Undistorted slopes of distorted ones, by Newton's method; NaN where it does not converge."""
+    if model == "none" or len(xy) == 0:
+        return np.asarray(xy, dtype=float)
+    guess = np.array(xy, dtype=float)
+    if model == "equidistant":  # a slope is the tangent of an angle: start from the angle
+        r = np.linalg.norm(xy, axis=1)
+        guess *= (np.tan(np.minimum(r, 1.5)) / np.maximum(r, 1e-9))[:, None]
+    error = np.full(len(xy), np.inf)
+    for _ in range(20):
+        residual = distort(model, coefficients, guess) - xy
+        error = np.abs(residual).max(axis=1)
+        if np.nanmax(error, initial=0.0) < 1e-13:
+            break
+        J = distort_jacobian(model, coefficients, guess)
+        det = J[:, 0, 0] * J[:, 1, 1] - J[:, 0, 1] * J[:, 1, 0]
+        det = np.where(np.abs(det) < 1e-12, np.nan, det)
+        guess = guess - np.stack(
+            [
+                (J[:, 1, 1] * residual[:, 0] - J[:, 0, 1] * residual[:, 1]) / det,
+                (J[:, 0, 0] * residual[:, 1] - J[:, 1, 0] * residual[:, 0]) / det,
+            ],
+            axis=1,
+        )
+    guess[~(error < 1e-9)] = np.nan
+    return guess

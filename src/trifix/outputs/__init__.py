@@ -1,0 +1,1 @@
+"""Who looks at Steps: results on disk, the report."""

@@ -1,0 +1,363 @@
+"""The nouns: frozen data that travels between stages.
+
+Arrays are read-only by agreement. A later record names rows of an earlier one by index, so nothing is relabelled on
+the way. Units are in the names; coordinates are ``sensor`` (left camera: x right, y down, z forward) or ``world``.
+"""
+
+from dataclasses import dataclass, field
+from enum import Enum, IntEnum
+
+import numpy as np
+from jaxtyping import Bool, Float, Int, UInt8, UInt16
+
+from trifix.geometry.camera import StereoRig
+from trifix.geometry.pose import Pose
+
+GreyOrColour = (
+    UInt8[np.ndarray, "h w"] | UInt16[np.ndarray, "h w"] | UInt8[np.ndarray, "h w 3"] | UInt16[np.ndarray, "h w 3"]
+)
+
+
+class Reason(Enum):
+    """Why a frame was refused: a closed list, each value a sentence for the operator."""
+
+    unreadable_image = "An image of this frame cannot be read."
+    no_calibration = "No calibration is known for this frame."
+    bad_points = "The frame holds values that are not finite numbers."
+    time_reversed = "The frame is older than the one before it."
+    too_few_points = "Fewer than three points were seen by both cameras."
+    no_candidate = "No constellation of the frame resembles one in the map."
+    not_proven = "A pose was found, but its agreement with the map could be chance."
+    residual = "A pose was found, but it leaves residuals above the threshold."
+    ambiguous = "Several poses explain the frame about equally well."
+    weak_geometry = "The targets were identified, but they do not hold the pose firmly enough."
+    other_island = "The frame belongs to a part of the object that nothing connects to the map yet."
+    out_of_time = "The search reached its limit before anything was proven."
+
+
+class PositionedReason(Enum):
+    """What is special about a positioned frame; most have none of these."""
+
+    defines_world = "The first frame: its sensor coordinates are the world's."
+    few_points = "Fewer than three points; carried by dots of a single camera or by the motion."
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class StereoImages:
+    """What the two cameras delivered for one frame."""
+
+    left: GreyOrColour
+    """Image of camera 0, (h, w) grey or (h, w, 3) BGR, 8 or 16 bit."""
+    right: GreyOrColour
+    """Image of camera 1; it may have another size than the left one."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Dots:
+    """The dots of one image."""
+
+    uv_px: Float[np.ndarray, "n 2"]
+    """Centre of the dot's ellipse (px), uncorrected for eccentricity."""
+    cov_px2: Float[np.ndarray, "n 2 2"]
+    """Covariance of the centre (px²), before the recording's noise scale."""
+    ellipse: Float[np.ndarray, "n 3"]
+    """Semi-axes a ≥ b (px) and the angle of the long one from the u axis (rad); NaN where unknown."""
+    label: Int[np.ndarray, "n"]
+    """Class of the dot (size, colour, code); -1 where it has none."""
+    row: Int[np.ndarray, "n"]
+    """Row in the recording's dots.csv, or 0..n-1 where the dots were detected."""
+
+    def __len__(self) -> int:
+        return len(self.uv_px)
+
+    @property
+    def diameter_px(self) -> Float[np.ndarray, "n"]:
+        """Diameter of the circle of the same area; NaN where unknown."""
+        return np.asarray(2 * np.sqrt(self.ellipse[:, 0] * self.ellipse[:, 1]))
+
+    @staticmethod
+    def of(
+        uv_px: Float[np.ndarray, "n 2"],
+        sigma_px: float = 0.3,
+        diameter_px: Float[np.ndarray, "n"] | None = None,
+    ) -> "Dots":
+        """Dots from their centres alone, all with the same circular error."""
+        n = len(uv_px)
+        radius = np.full(n, np.nan) if diameter_px is None else diameter_px / 2
+        return Dots(
+            uv_px=np.asarray(uv_px, dtype=float),
+            cov_px2=np.tile(np.eye(2) * sigma_px**2, (n, 1, 1)),
+            ellipse=np.stack([radius, radius, np.zeros(n)], axis=1),
+            label=np.full(n, -1),
+            row=np.arange(n),
+        )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class StereoDots:
+    """The dots of both images of one frame."""
+
+    left: Dots
+    """Dots of camera 0."""
+    right: Dots
+    """Dots of camera 1."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class StereoMatches:
+    """Pairs of dots that may be the same target; one dot may stand in several rows."""
+
+    left: Int[np.ndarray, "m"]
+    """Row of the left dot."""
+    right: Int[np.ndarray, "m"]
+    """Row of the right dot."""
+    epipolar_px: Float[np.ndarray, "m"]
+    """Signed distance from the epipolar line, in pixels of the undistorted image."""
+    epipolar_sigma_px: Float[np.ndarray, "m"]
+    """Its standard deviation from the dots' covariances, before the recording's noise scale."""
+
+    def __len__(self) -> int:
+        return len(self.left)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SensorPoints:
+    """Points of one frame in sensor coordinates."""
+
+    xyz_mm: Float[np.ndarray, "n 3"]
+    """Position, sensor coordinates (mm)."""
+    cov_mm2: Float[np.ndarray, "n 3 3"]
+    """Covariance (mm²), noise scale applied."""
+    match: Int[np.ndarray, "n"]
+    """Row of ``StereoMatches``; -1 where the points were given."""
+    label: Int[np.ndarray, "n"]
+    """Class of the target; -1 where it has none."""
+    row: Int[np.ndarray, "n"]
+    """Row in the recording's points.csv, or 0..n-1 where the points were triangulated."""
+    is_cov_known: bool = True
+    """False where the covariance is a default that awaits the recording's noise scale."""
+
+    def __len__(self) -> int:
+        return len(self.xyz_mm)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Unusable:
+    """A frame whose content could not be had."""
+
+    reason: Reason
+    """unreadable_image, no_calibration or bad_points."""
+    detail: str
+    """What was found, in one sentence."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Frame:
+    """One stereo exposure, at whatever level the source delivers it."""
+
+    index: int
+    """Number of the frame in its recording."""
+    timestamp_ns: int
+    """Time of the exposure (ns)."""
+    rig: StereoRig | None
+    """The stereo geometry of this exposure; None only with points, which need none."""
+    content: StereoImages | StereoDots | SensorPoints | Unusable
+    """What was seen."""
+
+
+class TargetState(IntEnum):
+    """How far a target is believed."""
+
+    provisional = 0
+    """Seen too seldom to be sure that it exists."""
+    trusted = 1
+    """Seen again from other poses, or given."""
+    quarantined = 2
+    """Known to have moved or to mislead; kept aside."""
+    removed = 3
+    """No longer part of the map; its row awaits a new target."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ReferenceMap:
+    """All targets known so far, in world coordinates: the paper's list S (part P6, eq. 1-1).
+
+    Rows keep their number for as long as the target lives. The arrays are views of storage that grows in place: copy
+    them to keep a state. Rows in state ``removed`` hold nothing.
+    """
+
+    id: Int[np.ndarray, "k"]
+    """Identity of the target, never used twice."""
+    xyz_mm: Float[np.ndarray, "k 3"]
+    """Position, world coordinates (mm)."""
+    cov_mm2: Float[np.ndarray, "k 3 3"]
+    """Covariance of the position (mm²)."""
+    view: Float[np.ndarray, "k 3"]
+    """Mean unit direction towards the sensors that saw it, or the given normal; NaN where unknown."""
+    sightings: Int[np.ndarray, "k"]
+    """Frames in which it was seen."""
+    last_seen: Int[np.ndarray, "k"]
+    """Index of the newest frame that saw it; -1 if none did."""
+    state: Int[np.ndarray, "k"]
+    """A ``TargetState``."""
+
+    def __len__(self) -> int:
+        return len(self.id)
+
+    @property
+    def alive(self) -> Bool[np.ndarray, "k"]:
+        """Rows that may be identified: trusted or provisional."""
+        return np.asarray(self.state <= TargetState.trusted)
+
+    def copy(self) -> "ReferenceMap":
+        """The same map with storage of its own."""
+        return ReferenceMap(
+            self.id.copy(),
+            self.xyz_mm.copy(),
+            self.cov_mm2.copy(),
+            self.view.copy(),
+            self.sightings.copy(),
+            self.last_seen.copy(),
+            self.state.copy(),
+        )
+
+    @staticmethod
+    def empty() -> "ReferenceMap":
+        """A map without targets."""
+        none = np.zeros(0, dtype=np.int64)
+        return ReferenceMap(
+            none, np.zeros((0, 3)), np.zeros((0, 3, 3)), np.zeros((0, 3)), none.copy(), none.copy(), none.copy()
+        )
+
+    @staticmethod
+    def given(
+        xyz_mm: Float[np.ndarray, "k 3"],
+        cov_mm2: Float[np.ndarray, "k 3 3"] | None = None,
+        view: Float[np.ndarray, "k 3"] | None = None,
+        id: Int[np.ndarray, "k"] | None = None,  # noqa: A002  (the column's name in map.csv)
+        sightings: Int[np.ndarray, "k"] | None = None,
+        state: Int[np.ndarray, "k"] | None = None,
+    ) -> "ReferenceMap":
+        """A map of targets known beforehand, trusted unless ``state`` says otherwise."""
+        k = len(xyz_mm)
+        return ReferenceMap(
+            id=np.arange(k) if id is None else id,
+            xyz_mm=np.asarray(xyz_mm, dtype=float),
+            cov_mm2=np.zeros((k, 3, 3)) if cov_mm2 is None else cov_mm2,
+            view=np.full((k, 3), np.nan) if view is None else view,
+            sightings=np.zeros(k, dtype=np.int64) if sightings is None else sightings,
+            last_seen=np.full(k, -1),
+            state=np.full(k, int(TargetState.trusted)) if state is None else state,
+        )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Identification:
+    """h hypotheses, likeliest first, each saying of c points which targets they are."""
+
+    point: Int[np.ndarray, "h c"]
+    """Row of the point."""
+    target: Int[np.ndarray, "h c"]
+    """Row of the target."""
+    comparisons: int = 0
+    """Comparisons of triangles or distances that were made to find them."""
+
+    def __len__(self) -> int:
+        return len(self.point)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Fix:
+    """A verified pose of the sensor."""
+
+    T_world_sensor: Pose
+    """The pose."""
+    cov: Float[np.ndarray, "6 6"]
+    """Covariance of δ = (translation mm, rotation rad), T_true = T · exp(δ); the map's uncertainty included."""
+    point: Int[np.ndarray, "c"]
+    """Rows of the identified points."""
+    target: Int[np.ndarray, "c"]
+    """Rows of the targets that they are."""
+    residual_mm: Float[np.ndarray, "c"]
+    """Distance of each identified point from its target (mm)."""
+    p_chance: float
+    """Upper bound of the probability that the agreement is chance; NaN where the frame defines the world."""
+    reason: PositionedReason | None = None
+    """What is special about this fix."""
+    detail: str = ""
+    """Free text."""
+
+    @property
+    def rms_mm(self) -> float:
+        """Root mean square of the residuals (mm)."""
+        return float(np.sqrt(np.mean(self.residual_mm**2))) if len(self.residual_mm) else float("nan")
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Rival:
+    """A pose that explained an ambiguous frame about as well as another."""
+
+    T_world_sensor: Pose
+    """The pose."""
+    log_odds: float
+    """Natural logarithm of its likelihood ratio against chance."""
+    matched: int
+    """Points that it explains."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class NoFix:
+    """A refusal, with its reason."""
+
+    why: Reason
+    """The reason, whose value is a sentence for the operator."""
+    detail: str = ""
+    """Numbers, where there are some."""
+    p_chance: float = float("nan")
+    """That of the best candidate; NaN if there was none."""
+    matched: int = 0
+    """Points that the best candidate explains."""
+    residual_mm: float = float("nan")
+    """Root mean square residual of the best candidate (mm)."""
+    rivals: tuple[Rival, ...] = ()
+    """The poses that could not be told apart, best first."""
+
+
+@dataclass(frozen=True, slots=True)
+class Event:
+    """Something that happened to the map."""
+
+    event: str
+    """target_moved, target_removed, target_merged, target_quarantined, island_founded, island_joined, update_undone."""
+    target: int | None
+    """Identity of the target, where it concerns one."""
+    detail: str = ""
+    """Free text."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Step:
+    """All that is known about one frame once it has been judged. Who watches, watches Steps."""
+
+    frame: Frame
+    """What came in."""
+    dots: StereoDots | None
+    """Dots, unless the recording begins with points."""
+    matches: StereoMatches | None
+    """Stereo pairs, unless the recording begins with points."""
+    points: SensorPoints | None
+    """Points; None for an unusable frame."""
+    identification: Identification | None
+    """The hypotheses, best first; None where none were sought."""
+    fix: Fix | NoFix
+    """The answer."""
+    added: Int[np.ndarray, "a"]
+    """Rows of targets that entered the map with this frame."""
+    map: ReferenceMap
+    """The map after this frame: a view that shares storage, copy it to keep it."""
+    noise_scale: float
+    """Factor on all standard deviations found so far."""
+    events: tuple[Event, ...] = ()
+    """What happened to the map."""
+    timings_ms: dict[str, float] = field(default_factory=dict)
+    """Milliseconds per stage."""

@@ -1,0 +1,1 @@
+"""Where stereo frames come from, other than a recording on disk: the simulator."""
