@@ -1,1 +1,48 @@
+"""Where is the sensor? Verified poses of a hand-held stereo sensor from identical round targets.
 
+    from trifix import Positioner, read_recording
+
+Names are loaded when they are first used, so that `trifix --help` waits for no numerics; `__init__.pyi` tells type
+checkers the same names.
+"""
+
+from importlib import import_module
+from importlib.metadata import version
+
+_MODULE_OF = {
+    "Camera": "trifix.geometry.camera",
+    "Config": "trifix.config",
+    "Fix": "trifix.records",
+    "Frame": "trifix.records",
+    "NoFix": "trifix.records",
+    "Pose": "trifix.geometry.pose",
+    "Positioner": "trifix.positioner",
+    "ReferenceMap": "trifix.records",
+    "Step": "trifix.records",
+    "StereoRig": "trifix.geometry.camera",
+    "TrifixError": "trifix.errors",
+    "detect": "trifix.stages.detect",
+    "identify": "trifix.stages.identify",
+    "match": "trifix.stages.match",
+    "orient": "trifix.stages.orient",
+    "position": "trifix.positioner",
+    "read_config": "trifix.config",
+    "read_map": "trifix.files.maps",
+    "read_recording": "trifix.files.recordings",
+    "triangulate": "trifix.stages.triangulate",
+    "update": "trifix.stages.update",
+    "verify": "trifix.stages.verify",
+}
+
+__all__ = sorted(_MODULE_OF)
+__version__ = version("trifix")
+
+
+def __getattr__(name: str) -> object:
+    if name not in _MODULE_OF:
+        raise AttributeError(f"module 'trifix' has no attribute {name!r}")
+    return getattr(import_module(_MODULE_OF[name]), name)
+
+
+def __dir__() -> list[str]:
+    return [*__all__, "__version__"]

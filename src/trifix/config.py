@@ -1,0 +1,203 @@
+"""All options in one place: every stage's own options composed, read from TOML, written to TOML.
+
+An option is declared once, in the frozen dataclass beside the stage that it steers: its name, unit, type, default and
+the sentence that explains it. This module reads all of that from the declaration and knows no single option.
+"""
+
+import ast
+import difflib
+import inspect
+import json
+import textwrap
+import tomllib
+from collections.abc import Mapping
+from dataclasses import Field, dataclass, field, fields, is_dataclass, replace
+from enum import Enum
+from functools import cache
+from pathlib import Path
+from types import NoneType, UnionType
+from typing import ClassVar, Literal, Protocol, TypeVar, Union, get_args, get_origin, get_type_hints, runtime_checkable
+
+import msgspec
+
+from trifix.errors import ConfigError
+from trifix.files.tables import read_text
+from trifix.stages.detect import DetectOptions
+from trifix.stages.identify import IdentifyOptions
+from trifix.stages.match import MatchOptions
+from trifix.stages.weigh import NoiseOptions
+
+
+@runtime_checkable
+class Dataclass(Protocol):
+    """Any dataclass."""
+
+    __dataclass_fields__: ClassVar[dict[str, Field[object]]]
+
+
+Options = TypeVar("Options", bound=Dataclass)
+
+
+@dataclass(frozen=True, slots=True)
+class Config:
+    """Every stage's options, in the order of the work."""
+
+    detect: DetectOptions = field(default_factory=DetectOptions)
+    """What counts as a dot."""
+    match: MatchOptions = field(default_factory=MatchOptions)
+    """Which dots of the two images may be the same target."""
+    noise: NoiseOptions = field(default_factory=NoiseOptions)
+    """How noisy the recording is taken to be."""
+    identify: IdentifyOptions = field(default_factory=IdentifyOptions)
+    """Where to look for the target that a point is."""
+
+
+def read_config(path: Path) -> Config:
+    """The options of a TOML file; what it leaves out keeps its default.
+
+    Raises:
+        ConfigError: the file cannot be read, or holds an unknown key or an impossible value.
+    """
+    text = read_text(path, ConfigError)
+    try:
+        values = tomllib.loads(text)
+    except tomllib.TOMLDecodeError as error:
+        raise ConfigError(f"{path}: is not TOML ({error}); `trifix config` prints one to start from.") from error
+    return with_values(Config(), values, source=str(path))
+
+
+def with_overrides(config: Config, overrides: Mapping[str, str]) -> Config:
+    """The same options but for those given as text, such as ``{"match.max_depth_mm": "900"}``.
+
+    Raises:
+        ConfigError: a key is unknown or its value impossible.
+    """
+    values: dict[str, object] = {}
+    for key, text in overrides.items():
+        *sections, name = key.split(".")
+        section = values
+        for each in sections:
+            inner = section.setdefault(each, {})
+            if not isinstance(inner, dict):
+                raise ConfigError(f"--set: {key} goes inside {each}, which was given a value of its own.")
+            section = inner
+        section[name] = _toml_value(text)
+    return with_values(config, values, source="--set")
+
+
+def to_toml(config: Dataclass) -> str:
+    """The options as TOML that ``read_config`` reads back, each with its sentence; unset ones are commented out."""
+    return "\n".join(_toml_lines(config, section="")).strip() + "\n"
+
+
+def with_values(options: Options, values: object, source: str, section: str = "") -> Options:
+    """A frozen dataclass, nested or not, with the given values in place of its own.
+
+    ``source`` and ``section`` say in an error where the value stood.
+    """
+    if not isinstance(values, dict):
+        raise ConfigError(f"{source}: {section} is {_shown(values)}, expected a section [{section}].")
+    types = get_type_hints(type(options))
+    known = [each.name for each in fields(options)]
+    changed: dict[str, object] = {}
+    for name, value in values.items():
+        key = f"{section}.{name}" if section else name
+        if name not in known:
+            raise ConfigError(f"{source}: {key} is unknown; {_suggestion(name, known, section)}")
+        current = getattr(options, name)
+        if is_dataclass(current) and not isinstance(current, type):
+            changed[name] = with_values(current, value, source, key)
+        else:
+            changed[name] = _converted(value, types[name], source, key)
+    try:
+        return replace(options, **changed)
+    except ConfigError as error:
+        raise ConfigError(f"{source}: {error}") from error
+
+
+@cache
+def sentences(options: type) -> dict[str, str]:
+    """The sentence under each field of a dataclass: the string that follows it in the source."""
+    body = ast.parse(textwrap.dedent(inspect.getsource(options))).body[0]
+    assert isinstance(body, ast.ClassDef)
+    found = {}
+    for declaration, below in zip(body.body, body.body[1:], strict=False):
+        match declaration, below:
+            case ast.AnnAssign(target=ast.Name(id=name)), ast.Expr(value=ast.Constant(value=str(sentence))):
+                found[name] = " ".join(sentence.split())
+    return found
+
+
+def _converted(value: object, expected: object, source: str, key: str) -> object:
+    try:
+        return msgspec.convert(value, type=expected)
+    except msgspec.ValidationError as error:
+        raise ConfigError(f"{source}: {key} is {_shown(value)}, expected {_described(expected)}.") from error
+
+
+def _suggestion(name: str, known: list[str], section: str) -> str:
+    near = difflib.get_close_matches(name, known, n=1, cutoff=0.5)
+    if near:
+        return f"did you mean {section}.{near[0]}?" if section else f"did you mean {near[0]}?"
+    return f"expected one of {', '.join(known)}."
+
+
+def _described(expected: object) -> str:
+    """A type in words."""
+    arguments = get_args(expected)
+    origin = get_origin(expected)
+    if origin is Literal:
+        return "one of " + ", ".join(_shown(each) for each in arguments)
+    if origin in (Union, UnionType):
+        return " or ".join(_described(each) for each in arguments if each is not NoneType)
+    if origin is tuple:
+        several = [each for each in arguments if each is not Ellipsis]
+        return "a list of " + (_described(several[0]) if Ellipsis in arguments else f"{len(several)} values")
+    if isinstance(expected, type) and issubclass(expected, Enum):
+        return "one of " + ", ".join(_shown(each.value) for each in expected)
+    words: dict[object, str] = {
+        bool: "true or false",
+        int: "a whole number",
+        float: "a number",
+        str: "a text in quotes",
+    }
+    return words.get(expected, str(expected))
+
+
+def _shown(value: object) -> str:
+    """A value as it would stand in TOML."""
+    match value:
+        case bool():
+            return str(value).lower()
+        case str():
+            return json.dumps(value, ensure_ascii=False)
+        case Enum():
+            return _shown(value.value)
+        case list() | tuple():
+            return "[" + ", ".join(_shown(each) for each in value) + "]"
+        case dict():
+            return "a section"
+        case _:
+            return repr(value)
+
+
+def _toml_value(text: str) -> object:
+    """What the text says in TOML; the text itself where it says nothing, so that quotes are not needed."""
+    try:
+        return tomllib.loads(f"value = {text}")["value"]
+    except tomllib.TOMLDecodeError:
+        return text
+
+
+def _toml_lines(options: Dataclass, section: str) -> list[str]:
+    explained = sentences(type(options))
+    own, below = [f"[{section}]"] if section else [], []
+    for each in fields(options):
+        value = getattr(options, each.name)
+        if is_dataclass(value) and not isinstance(value, type):
+            below += ["", *_toml_lines(value, f"{section}.{each.name}" if section else each.name)]
+            continue
+        if each.name in explained:
+            own += textwrap.wrap(explained[each.name], 117, initial_indent="# ", subsequent_indent="# ")
+        own.append(f"# {each.name} =" if value is None else f"{each.name} = {_shown(value)}")
+    return own + below
