@@ -8,7 +8,7 @@ errors are not alike in all directions, as a stereo sensor's never are.
 import numpy as np
 from jaxtyping import Float
 
-from trifix.geometry.pose import Pose, skew
+from trifix.geometry.pose import Pose
 
 
 def align(
@@ -46,15 +46,17 @@ def align_weighted(
     Raises:
         numpy.linalg.LinAlgError: the pairs do not determine a pose (fewer than three, or on one line).
     """
+    spread = np.linalg.svd(xyz_b_mm - xyz_b_mm.mean(axis=0), compute_uv=False)
+    if len(xyz_b_mm) < 3 or spread[1] <= 1e-9 * spread[0]:
+        raise np.linalg.LinAlgError("fewer than three points that are not on one line do not determine a pose")
     T = align(xyz_b_mm, xyz_a_mm) if initial is None else initial
     cov = np.zeros((6, 6))
     for _ in range(iterations):
         S = T.R @ cov_b_mm2 @ T.R.T + cov_a_mm2
-        # r(δ) = p_a − T exp(δ) p_b  ≈  r − R [I, −[p_b]×] δ
+        # r(δ) = p_a − T exp(δ) p_b  ≈  r − R [I, −[p_b]×] δ;  column k of −R [p]× is R (e_k × p)
         J = np.empty((len(xyz_b_mm), 3, 6))
         J[:, :, :3] = T.R
-        for row, p in enumerate(xyz_b_mm):
-            J[row, :, 3:] = -T.R @ skew(p)
+        J[:, :, 3:] = T.R @ np.swapaxes(np.cross(np.eye(3), xyz_b_mm[:, None, :]), 1, 2)
         r = xyz_a_mm - T.apply(xyz_b_mm)
         W_J = np.linalg.solve(S, J)
         cov = np.linalg.inv(np.einsum("nij,nik->jk", J, W_J))

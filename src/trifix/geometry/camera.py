@@ -69,13 +69,16 @@ class Camera:
         return np.asarray(np.linalg.inv(J))
 
     def sees(self, xyz_mm: Float[np.ndarray, "n 3"], margin_px: float = 0.0) -> np.ndarray:
-        """Which points (camera coordinates) fall on the image, at least ``margin_px`` inside its edge: (n,) bool."""
+        """Which points (camera coordinates) fall on the image, at least ``margin_px`` inside its edge: (n,) bool.
+
+        Points so far off the axis that the distortion model folds them back into the image are not seen.
+        """
         uv = self.project(xyz_mm)
-        with np.errstate(invalid="ignore"):
-            inside = (uv >= margin_px - 0.5) & (
-                uv <= [self.width_px - 0.5 - margin_px, self.height_px - 0.5 - margin_px]
-            )
-        return np.asarray(inside.all(axis=1))
+        low, high = margin_px - 0.5, np.array([self.width_px, self.height_px]) - 0.5 - margin_px
+        seen = np.asarray(((uv >= low) & (uv <= high)).all(axis=1))
+        slopes = xyz_mm[seen, :2] / xyz_mm[seen, 2:]
+        seen[seen] = (np.abs(self.unproject(uv[seen]) - slopes) < 1e-6 * (1 + np.abs(slopes))).all(axis=1)
+        return seen
 
 
 @dataclass(frozen=True, slots=True)
@@ -162,13 +165,15 @@ def distort_jacobian(
 def undistort(
     model: DistortionModel, coefficients: tuple[float, ...], xy: Float[np.ndarray, "n 2"]
 ) -> Float[np.ndarray, "n 2"]:
-    """Undistorted slopes of distorted ones, by Newton's method; NaN where it does not converge."""
+    """Undistorted slopes of distorted ones, by Newton's method; NaN where the model cannot be inverted.
+
+    That is where no slope distorts to the given one, or only one beyond the fold at which the model turns back.
+    """
     if model == "none" or len(xy) == 0:
         return np.asarray(xy, dtype=float)
+    if model == "equidistant":
+        return _undistort_equidistant(coefficients, np.asarray(xy, dtype=float))
     guess = np.array(xy, dtype=float)
-    if model == "equidistant":  # a slope is the tangent of an angle: start from the angle
-        r = np.linalg.norm(xy, axis=1)
-        guess *= (np.tan(np.minimum(r, 1.5)) / np.maximum(r, 1e-9))[:, None]
     error = np.full(len(xy), np.inf)
     for _ in range(20):
         residual = distort(model, coefficients, guess) - xy
@@ -185,5 +190,28 @@ def undistort(
             ],
             axis=1,
         )
-    guess[~(error < 1e-9)] = np.nan
+    # before the fold the model keeps orientation (det > 0) and does not turn slopes round (trace > 0)
+    J = distort_jacobian(model, coefficients, guess)
+    is_before_fold = (np.linalg.det(J) > 0) & (np.trace(J, axis1=1, axis2=2) > 0)
+    guess[~((error < 1e-9) & is_before_fold)] = np.nan
     return guess
+
+
+def _undistort_equidistant(coefficients: tuple[float, ...], xy: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n 2"]:
+    """The same for ``equidistant``: Newton's method on the angle θ, whose polynomial is nearly a straight line."""
+    k1, k2, k3, k4 = coefficients
+    theta_d = np.linalg.norm(xy, axis=1)
+    theta = np.minimum(theta_d, 1.5)
+    error = np.full(len(xy), np.inf)
+    slope = np.ones(len(xy))
+    for _ in range(20):
+        t2 = theta * theta
+        residual = theta * (1 + t2 * (k1 + t2 * (k2 + t2 * (k3 + t2 * k4)))) - theta_d
+        slope = 1 + t2 * (3 * k1 + t2 * (5 * k2 + t2 * (7 * k3 + t2 * 9 * k4)))
+        error = np.abs(residual)
+        if np.nanmax(error, initial=0.0) < 1e-13:
+            break
+        theta = theta - residual / np.where(slope > 1e-6, slope, np.nan)
+    is_invertible = (error < 1e-9) & (slope > 0) & (theta < np.pi / 2)
+    ratio = np.where(theta_d > 1e-9, np.tan(theta) / np.maximum(theta_d, 1e-9), 1.0)
+    return np.asarray(np.where(is_invertible[:, None], xy * ratio[:, None], np.nan))

@@ -67,7 +67,7 @@ class Pose:
         )
         q = Q[int(np.argmax(np.diag(Q)))]
         q = q / np.linalg.norm(q)
-        return -q if q[3] < 0 else q
+        return np.asarray(-q if q[3] < 0 else q)
 
     def apply(self, xyz_mm: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
         """The points (n, 3) in the coordinates on the left of the pose's name."""
@@ -108,7 +108,7 @@ def exp_rotation(phi_rad: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3 3"]:
     if theta < _SMALL_RAD:
         a, b = 1 - theta**2 / 6, 0.5 - theta**2 / 24
     else:
-        a, b = np.sin(theta) / theta, (1 - np.cos(theta)) / theta**2
+        a, b = np.sin(theta) / theta, 2 * (np.sin(theta / 2) / theta) ** 2  # 1 − cos θ = 2 sin² θ/2
     return np.asarray(np.eye(3) + a * W + b * (W @ W))
 
 
@@ -128,5 +128,5 @@ def _left_jacobian(phi: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3 3"]:
     if theta < _SMALL_RAD:
         a, b = 0.5 - theta**2 / 24, 1 / 6 - theta**2 / 120
     else:
-        a, b = (1 - np.cos(theta)) / theta**2, (theta - np.sin(theta)) / theta**3
+        a, b = 2 * (np.sin(theta / 2) / theta) ** 2, (theta - np.sin(theta)) / theta**3
     return np.asarray(np.eye(3) + a * W + b * (W @ W))
