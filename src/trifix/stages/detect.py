@@ -1,0 +1,131 @@
+"""Find the dots of one image: bright or dark round targets, each with a sub-pixel centre and its covariance.
+
+Knows grey values and nothing else: no camera, no map, no earlier image.
+"""
+
+from dataclasses import dataclass
+from typing import Literal
+
+import cv2
+import numpy as np
+from jaxtyping import Float
+
+from trifix.kernels.detection import blobs, fit_ellipses
+from trifix.records import Dots, GreyOrColour
+
+_SIGN = {"dark": -1.0, "bright": 1.0}
+# A level of the pyramid answers for blobs from 5 to 12 of its own pixels across (the finest also for smaller ones);
+# the limits overlap, since a dot may be measured a little larger or smaller from one level to the next.
+_LEVEL_MIN_PX, _LEVEL_MAX_PX, _WINDOW_PX = 5.0, 14.0, 25
+_MIN_FILL = 0.75
+
+
+@dataclass(frozen=True)
+class DetectOptions:
+    """What counts as a dot."""
+
+    polarity: Literal["auto", "dark", "bright"] = "auto"
+    """Dots darker or brighter than what surrounds them; auto takes what the image has more good ones of."""
+    min_diameter_px: float = 3.0
+    """Least diameter of a dot: twice the root of the product of its semi-axes (px)."""
+    max_diameter_px: float = 250.0
+    """Largest diameter of a dot (px)."""
+    min_axis_ratio: float = 0.34
+    """Least ratio of the short axis to the long one; a round target tilted by 70 degrees shows 0.34."""
+    min_contrast: float = 0.15
+    """Least step at the dot's edge, as a fraction of the brighter side."""
+    max_residual: float = 0.12
+    """Largest rms residual of the fitted ellipse, as a fraction of the step; lower refuses more clutter."""
+
+
+def detect(image: GreyOrColour, options: DetectOptions) -> Dots:
+    """Dots of one image, from top to bottom.
+
+    Blobs on the local threshold at every level of a pyramid; then least squares of a blurred ellipse to the grey
+    values, which gives centre, axes and covariance and tells dots from clutter by what it leaves.
+    """
+    grey = np.ascontiguousarray(cv2.cvtColor(image, cv2.COLOR_BGR2GRAY) if image.ndim == 3 else image, np.float32)
+    if options.polarity == "auto":
+        fits = max((_fits(grey, sign, options) for sign in _SIGN.values()), key=_evidence)
+    else:
+        fits = _fits(grey, _SIGN[options.polarity], options)
+    fits = fits[np.lexsort((fits[:, 0], fits[:, 1]))]
+    cov = fits[:, [2, 3, 3, 4]].reshape(-1, 2, 2)
+    n = len(fits)
+    return Dots(fits[:, :2], cov, fits[:, 5:8], np.full(n, -1), np.arange(n))
+
+
+def _fits(grey: Float[np.ndarray, "h w"], sign: float, options: DetectOptions) -> Float[np.ndarray, "n 12"]:
+    """Accepted fits of one polarity."""
+    start, coarseness = _candidates(grey, sign, options)
+    fits = fit_ellipses(grey, start, sign, coarseness)
+    fits = fits[np.isfinite(fits[:, 0])]
+    u, v, a, b = fits[:, 0], fits[:, 1], fits[:, 5], fits[:, 6]
+    around, step, residual = fits[:, 9], np.abs(fits[:, 10]), fits[:, 11]
+    h, w = grey.shape
+    diameter = 2 * np.sqrt(a * b)
+    good = (
+        (diameter >= options.min_diameter_px)
+        & (diameter <= options.max_diameter_px)
+        & (b >= options.min_axis_ratio * a)
+        & (step >= options.min_contrast * np.maximum(around, around + sign * step))
+        & (residual <= options.max_residual * step)
+        & (np.minimum(u, v) >= a)
+        & (u + a <= w - 1)
+        & (v + a <= h - 1)
+    )
+    return _distinct(fits[good])
+
+
+def _distinct(fits: Float[np.ndarray, "n 12"]) -> Float[np.ndarray, "k 12"]:
+    """The fits without the worse of any two whose centres lie within the short axis of one of them."""
+    order = np.argsort(fits[:, 11] / np.abs(fits[:, 10]), kind="stable")
+    fits = fits[order]
+    close = np.hypot(*(fits[:, None, :2] - fits[None, :, :2]).transpose(2, 0, 1)) < np.maximum(
+        fits[:, None, 6], fits[None, :, 6]
+    )
+    kept = np.ones(len(fits), dtype=bool)
+    for k in range(len(fits)):
+        if kept[k]:
+            kept[k + 1 :] &= ~close[k, k + 1 :]
+    return fits[kept]
+
+
+def _candidates(
+    grey: Float[np.ndarray, "h w"], sign: float, options: DetectOptions
+) -> tuple[Float[np.ndarray, "m 5"], Float[np.ndarray, "m"]]:
+    """Centre and second moments (px, px²) of elliptic blobs, and how far off they may be (px)."""
+    start, coarseness = [], []
+    level, size = grey, 1.0
+    while size == 1 or _LEVEL_MIN_PX * size <= options.max_diameter_px:
+        if _LEVEL_MAX_PX * size >= options.min_diameter_px:
+            threshold = _threshold(level, sign, options.min_contrast)
+            least = max(0.7 * options.min_diameter_px / size, 0.0 if size == 1 else _LEVEL_MIN_PX)
+            found = blobs(
+                level,
+                threshold,
+                sign,
+                max(np.pi / 4 * least**2, 4.0),
+                _LEVEL_MAX_PX / np.sqrt(options.min_axis_ratio),
+                options.min_axis_ratio * 0.9,
+                _MIN_FILL,
+            )
+            start.append(found[:, :5] * [size, size, size**2, size**2, size**2])
+            start[-1][:, :2] += (size - 1) / 2
+            coarseness.append(np.full(len(found), 0.5 * (size - 1)))
+        level = cv2.resize(level, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
+        size *= 2
+    return np.concatenate(start), np.concatenate(coarseness)
+
+
+def _threshold(level: Float[np.ndarray, "h w"], sign: float, min_contrast: float) -> Float[np.ndarray, "h w"]:
+    """Midway between the darkest and the brightest pixel about (Bernsen 1986); out of reach where these are alike."""
+    window = cv2.getStructuringElement(cv2.MORPH_RECT, (_WINDOW_PX, _WINDOW_PX))
+    darkest, brightest = cv2.erode(level, window), cv2.dilate(level, window)
+    is_edged = brightest - darkest > min_contrast * brightest
+    return np.asarray(np.where(is_edged, 0.5 * (darkest + brightest), np.float32(sign * np.inf)), dtype=np.float32)
+
+
+def _evidence(fits: Float[np.ndarray, "n 12"]) -> float:
+    """How much a set of fits looks like a set of targets."""
+    return float(np.sum(np.abs(fits[:, 10]) / fits[:, 11]))
