@@ -123,13 +123,13 @@ def test_overrides_need_no_quotes_and_take_effect_together() -> None:
 
 def test_an_unknown_override_names_the_nearest() -> None:
     with pytest.raises(
-        ConfigError, match=r"^--set: match\.max_dept_mm is unknown; did you mean match\.max_depth_mm\?$"
+        ConfigError, match=r"^command line: match\.max_dept_mm is unknown; did you mean match\.max_depth_mm\?$"
     ):
         with_overrides(Config(), {"match.max_dept_mm": "900"})
 
 
 def test_a_section_cannot_be_a_value_too() -> None:
-    with pytest.raises(ConfigError, match=r"^--set: match\.max_depth_mm goes inside match, which was given a value"):
+    with pytest.raises(ConfigError, match=r"^command line: match\.max_depth_mm goes inside match, which"):
         with_overrides(Config(), {"match": "3", "match.max_depth_mm": "900"})
 
 

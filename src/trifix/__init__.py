@@ -12,33 +12,44 @@ from importlib.metadata import version
 _MODULE_OF = {
     "Camera": "trifix.geometry.camera",
     "Config": "trifix.config",
+    "Dots": "trifix.records",
     "Fix": "trifix.records",
     "Frame": "trifix.records",
     "NoFix": "trifix.records",
     "Pose": "trifix.geometry.pose",
     "Positioner": "trifix.positioner",
+    "Reason": "trifix.records",
+    "Recording": "trifix.files.recordings",
     "ReferenceMap": "trifix.records",
+    "Report": "trifix.outputs.report",
+    "ResultsWriter": "trifix.outputs.results",
+    "SensorPoints": "trifix.records",
     "Step": "trifix.records",
+    "StereoDots": "trifix.records",
+    "StereoImages": "trifix.records",
+    "StereoMatches": "trifix.records",
     "StereoRig": "trifix.geometry.camera",
     "TrifixError": "trifix.errors",
     "detect": "trifix.stages.detect",
-    "identify": "trifix.stages.identify",
+    "evaluate": "trifix.evaluation",
+    "identifier": "trifix.stages.identify",
     "match": "trifix.stages.match",
     "orient": "trifix.stages.orient",
-    "position": "trifix.positioner",
     "read_config": "trifix.config",
     "read_map": "trifix.files.maps",
     "read_recording": "trifix.files.recordings",
+    "simulate": "trifix.sources.simulation",
     "triangulate": "trifix.stages.triangulate",
     "update": "trifix.stages.update",
     "verify": "trifix.stages.verify",
 }
 
 __all__ = sorted(_MODULE_OF)
-__version__ = version("trifix")
 
 
 def __getattr__(name: str) -> object:
+    if name == "__version__":
+        return version("trifix")
     if name not in _MODULE_OF:
         raise AttributeError(f"module 'trifix' has no attribute {name!r}")
     return getattr(import_module(_MODULE_OF[name]), name)

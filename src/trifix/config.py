@@ -25,6 +25,8 @@ from trifix.files.tables import read_text
 from trifix.stages.detect import DetectOptions
 from trifix.stages.identify import IdentifyOptions
 from trifix.stages.match import MatchOptions
+from trifix.stages.update import UpdateOptions
+from trifix.stages.verify import VerifyOptions
 from trifix.stages.weigh import NoiseOptions
 
 
@@ -50,6 +52,10 @@ class Config:
     """How noisy the recording is taken to be."""
     identify: IdentifyOptions = field(default_factory=IdentifyOptions)
     """Where to look for the target that a point is."""
+    verify: VerifyOptions = field(default_factory=VerifyOptions)
+    """When a pose is believed."""
+    update: UpdateOptions = field(default_factory=UpdateOptions)
+    """How the map grows."""
 
 
 def read_config(path: Path) -> Config:
@@ -79,10 +85,10 @@ def with_overrides(config: Config, overrides: Mapping[str, str]) -> Config:
         for each in sections:
             inner = section.setdefault(each, {})
             if not isinstance(inner, dict):
-                raise ConfigError(f"--set: {key} goes inside {each}, which was given a value of its own.")
+                raise ConfigError(f"command line: {key} goes inside {each}, which was given a value of its own.")
             section = inner
         section[name] = _toml_value(text)
-    return with_values(config, values, source="--set")
+    return with_values(config, values, source="command line")
 
 
 def to_toml(config: Dataclass) -> str:

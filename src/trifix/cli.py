@@ -1,0 +1,243 @@
+"""The command line: one short function a command, in the order of a working day.
+
+Numerics are imported inside the functions, so that help and usage errors come at once. What goes wrong is said in one
+sentence on stderr. Exit codes: 0 complete, 1 bad input, 2 usage, 130 interrupted.
+"""
+
+import os
+import signal
+import sys
+from pathlib import Path
+from typing import Annotated, Literal
+
+from cyclopts import App, CycloptsError, Parameter
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, ProgressColumn, Task, TextColumn, TimeRemainingColumn
+from rich.text import Text
+
+import trifix
+from trifix.errors import TrifixError
+
+app = App(
+    name="trifix",
+    help="Where is the sensor? Verified poses of a hand-held stereo sensor from identical round targets.",
+    version=lambda: _version(),
+    default_parameter=Parameter(negative=()),
+    print_error=False,
+    exit_on_error=False,
+    result_action="return_value",
+    suppress_keyboard_interrupt=False,
+)
+
+
+def _is_setting(_: object, settings: tuple[str, ...]) -> None:
+    for each in settings:
+        if "=" not in each:
+            raise ValueError(f'"{each}" has no value; write stage.key=value.')
+
+
+Level = Literal["images", "dots", "points"]
+Out = Annotated[Path, Parameter(name=["--out", "-o"])]
+Settings = Annotated[tuple[str, ...], Parameter(name="--set", validator=_is_setting)]
+
+
+@app.command(sort_key=0)
+def run(
+    recording: Path,
+    /,
+    *,
+    out: Out,
+    online: bool = False,
+    level: Annotated[Level | None, Parameter(name="--from")] = None,
+    map_: Annotated[Path | None, Parameter(name="--map")] = None,
+    map_mode: Literal["frozen", "grow"] = "grow",
+    polarity: Literal["auto", "dark", "bright"] | None = None,
+    frame_triangles: Literal["auto", "all", "local"] | None = None,
+    sigma_px: float | None = None,
+    target_diameter_mm: float | None = None,
+    config: Path | None = None,
+    settings: Settings = (),
+) -> None:
+    """Position every frame of a recording.
+
+    Args:
+        recording: Folder of the recording.
+        out: Folder for the results.
+        online: Judge every frame by what was known at its time, and never rewrite a row.
+        level: Begin with images, dots or points; without it, with the richest that the recording holds.
+        map_: CSV file of targets known beforehand; its coordinates become the world's.
+        map_mode: Leave the given map as it is, or let it grow.
+        polarity: Brightness of the targets against what surrounds them.
+        frame_triangles: Look at all triangles of a frame, or at those between neighbours.
+        sigma_px: Standard deviation of a dot's centre to start from, where the recording states none (px).
+        target_diameter_mm: Diameter of the targets (mm), where it is known.
+        config: TOML file of options; `trifix config` prints one.
+        settings: An option by its full name, such as match.max_depth_mm=900; may be repeated.
+    """
+    options = _options(
+        config,
+        settings,
+        {"detect.polarity": polarity, "identify.frame_triangles": frame_triangles, "noise.sigma_px": sigma_px},
+    )
+    given = None if map_ is None else trifix.read_map(map_)
+    frames = trifix.read_recording(recording, level, options.noise.sigma_px)
+    _position(frames, out, options, given, is_map_frozen=map_mode == "frozen", is_online=online)
+
+
+@app.command(sort_key=1)
+def simulate(scene: str, /, *, out: Out, level: Level = "dots", seed: int = 0, frames: int | None = None) -> None:
+    """Make a recording whose truth is known.
+
+    Args:
+        scene: Name of the scene.
+        out: Folder for the recording and its truth.
+        level: What to record.
+        seed: Another seed makes another recording of the same scene.
+        frames: Number of frames; without it, the scene's own.
+    """
+    with _progress() as progress:
+        trifix.simulate(scene, out, level, seed, frames, progress)
+
+
+@app.command(sort_key=2)
+def demo(*, out: Out = Path("demo")) -> None:
+    """Simulate a small recording as images, position it and report on it.
+
+    Args:
+        out: Folder for everything.
+    """
+    with _progress() as progress:
+        trifix.simulate("demo", out, "images", 0, None, progress)
+    _position(trifix.read_recording(out / "recording"), out / "results", trifix.Config())
+
+
+@app.command(sort_key=3)
+def evaluate(results: Path, truth: Path, /) -> None:
+    """Compare results with the truth.
+
+    Args:
+        results: Folder that `trifix run` wrote.
+        truth: Folder of the truth.
+    """
+    print(trifix.evaluate(results, truth))
+
+
+@app.command(sort_key=4)
+def config(*, config: Path | None = None, settings: Settings = ()) -> None:
+    """Print the options in effect, each with its meaning, as TOML.
+
+    Args:
+        config: TOML file of options.
+        settings: An option by its full name, such as match.max_depth_mm=900; may be repeated.
+    """
+    from trifix.config import to_toml
+
+    print(to_toml(_options(config, settings)), end="")
+
+
+@app.command(sort_key=5)
+def warmup() -> None:
+    """Compile the inner loops, once for this machine, so that the first frame need not wait for it."""
+    import pkgutil
+    from importlib import import_module
+
+    from trifix import kernels
+
+    names = [f"{kernels.__name__}.{module.name}" for module in pkgutil.iter_modules(kernels.__path__)]
+    with _progress("modules") as progress:
+        for name in progress.track(names, description="compiling"):
+            import_module(name).warm_up()
+
+
+def main() -> None:
+    """Run the command line and leave with its exit code."""
+    signal.signal(signal.SIGTERM, signal.default_int_handler)  # as ctrl-C: finished results stay whole
+    try:
+        app()
+        sys.stdout.flush()
+    except CycloptsError as error:
+        _leave(str(error), 2)
+    except TrifixError as error:
+        _leave(str(error), 1)
+    except BrokenPipeError:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # or the interpreter complains as it ends
+        _leave("whoever read the output has gone, so not all of it was printed.", 1)
+    except OSError as error:
+        _leave(f"{error.filename or 'a file'}: {error.strerror or error}.", 1)
+    except KeyboardInterrupt:
+        _leave("interrupted; what was finished until then is whole.", 130)
+
+
+def _leave(sentence: str, code: int) -> None:
+    print(f"trifix: {sentence}", file=sys.stderr)
+    sys.exit(code)
+
+
+def _version() -> str:
+    from importlib.metadata import version
+
+    return f"trifix {version('trifix')}"
+
+
+def _options(
+    file: Path | None, settings: tuple[str, ...], shorthands: dict[str, object] | None = None
+) -> "trifix.Config":
+    """The options of a file, or the defaults, with what was said on the command line in their place."""
+    from trifix.config import with_overrides
+
+    given = {key: str(value) for key, value in (shorthands or {}).items() if value is not None}
+    for each in settings:
+        key, value = each.split("=", 1)
+        given[key.strip()] = value.strip()
+    return with_overrides(trifix.read_config(file) if file else trifix.Config(), given)
+
+
+def _position(
+    recording: "trifix.Recording",
+    out: Path,
+    options: "trifix.Config",
+    given: "trifix.ReferenceMap | None" = None,
+    is_map_frozen: bool = False,
+    is_online: bool = False,
+) -> None:
+    """Judge every frame, write down what was found, and say what it amounts to."""
+    from trifix.config import to_toml
+    from trifix.outputs.report import Report
+    from trifix.outputs.results import ResultsWriter
+
+    positioner = trifix.Positioner(options, given, is_map_frozen, recording.is_noise_stated)
+    report = Report(recording)
+    with (
+        ResultsWriter(out, recording.path.name, recording.level, to_toml(options), is_online) as results,
+        _progress() as progress,
+    ):
+        for step in progress.track(positioner.run(recording), len(recording), description="positioning"):
+            results.write(step)
+            report.show(step)
+        summary = results.finish()
+    report.write(out / "report.html", summary)
+    Console().print(summary)
+
+
+class _Rate(ProgressColumn):
+    """How fast it goes."""
+
+    def __init__(self, unit: str) -> None:
+        super().__init__()
+        self._unit = unit
+
+    def render(self, task: Task) -> Text:
+        speed = task.finished_speed or task.speed
+        return Text("" if speed is None else f"{speed:.1f} {self._unit}/s")
+
+
+def _progress(unit: str = "frames") -> Progress:
+    """A progress bar on stderr."""
+    return Progress(
+        TextColumn("{task.description:12}"),
+        BarColumn(),
+        MofNCompleteColumn(),
+        _Rate(unit),
+        TimeRemainingColumn(elapsed_when_finished=True),
+        console=Console(stderr=True),
+    )

@@ -1,0 +1,225 @@
+"""The command line as a stranger meets it: what it prints, where, and with which exit code it leaves."""
+
+import csv
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+from typing import get_args
+
+import pytest
+
+from trifix import cli
+
+SMALL = Path(__file__).parent / "data" / "small"
+
+
+def trifix(*arguments: object) -> "subprocess.CompletedProcess[str]":
+    return subprocess.run(command(*arguments), capture_output=True, text=True, check=False)
+
+
+def command(*arguments: object) -> list[str]:
+    return [sys.executable, "-m", "trifix", *map(str, arguments)]
+
+
+@pytest.fixture(scope="module")
+def results(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The small recording, positioned."""
+    out = tmp_path_factory.mktemp("run") / "results"
+    done = trifix("run", SMALL / "recording", "-o", out)
+    assert done.returncode == 0, done.stderr
+    return out
+
+
+@pytest.mark.parametrize(
+    ("arguments", "code"),
+    [
+        (["--help"], 0),
+        (["run", "--help"], 0),
+        (["--version"], 0),
+        (["runn"], 2),
+        (["run", "recording"], 2),
+        (["run", "recording", "-o", "out", "--from", "video"], 2),
+        (["run", "recording", "-o", "out", "--set", "match.max_depth_mm"], 2),
+        (["simulate", "head", "-o", "out", "--seed", "one"], 2),
+    ],
+)
+def test_help_and_usage_errors_load_no_numerics(arguments: list[str], code: int) -> None:
+    program = (
+        "import sys, trifix.cli\n"
+        f"sys.argv = ['trifix', *{arguments}]\n"
+        "try: trifix.cli.main()\n"
+        "except SystemExit as leaving: code = leaving.code\n"
+        "else: code = 0\n"
+        "print('\\n', code, [name for name in ('numpy', 'cv2', 'numba', 'scipy') if name in sys.modules])"
+    )
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
+    assert done.stdout.splitlines()[-1].strip() == f"{code} []"
+
+
+@pytest.mark.parametrize(
+    ("arguments", "text"),
+    [
+        (["runn"], 'Unknown command "runn". Did you mean "run"?'),
+        (["run", "here", "-o", "out", "--onlin"], "Unknown option: --onlin. Did you mean --online?"),
+        (
+            ["run", "here", "-o", "out", "--from", "video"],
+            '"video" for --from. Choose from: "images", "dots", "points".',
+        ),
+        (["run", "here", "-o", "out", "--sigma-px", "small"], 'unable to convert "small" into float.'),
+        (["run", "here", "-o", "out", "--set", "match"], '"match" has no value; write stage.key=value.'),
+    ],
+)
+def test_a_usage_error_is_one_sentence_and_code_2(arguments: list[str], text: str) -> None:
+    done = trifix(*arguments)
+    assert done.returncode == 2
+    assert done.stdout == ""
+    assert done.stderr.startswith("trifix: ")
+    assert done.stderr.count("\n") == 1
+    assert text in done.stderr
+
+
+@pytest.mark.parametrize(
+    ("arguments", "text"),
+    [
+        (["run", "nowhere", "-o", "out"], "nowhere is not a folder, expected a recording."),
+        (["run", SMALL / "recording", "-o", "out", "--map", "nowhere.csv"], "nowhere.csv does not exist."),
+        (["run", SMALL / "recording", "-o", "out", "--config", "nowhere.toml"], "nowhere.toml does not exist."),
+        (
+            ["run", SMALL / "recording", "-o", "out", "--sigma-px", "-1"],
+            "command line: noise.sigma_px is -1.0, expected",
+        ),
+        (["config", "--set", "match.max_dept_mm=900"], "did you mean match.max_depth_mm?"),
+        (["config", "--set", "detect.polarity=green"], '"green", expected one of "auto", "dark", "bright".'),
+        (["simulate", "hed", "-o", "out"], "did you mean 'head'?"),
+    ],
+)
+def test_bad_input_is_one_sentence_and_code_1(
+    arguments: list[object], text: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    done = trifix(*arguments)
+    assert done.returncode == 1
+    assert done.stdout == ""
+    assert done.stderr.startswith("trifix: ")
+    assert done.stderr.count("\n") == 1
+    assert text in done.stderr
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_the_version_is_that_of_the_package() -> None:
+    assert trifix("--version").stdout == f"trifix {cli.trifix.__version__}\n"
+
+
+def test_levels_are_those_of_recordings() -> None:
+    from trifix.files.recordings import Level
+
+    assert get_args(cli.Level) == get_args(Level)
+
+
+def test_config_prints_what_it_was_told(tmp_path: Path) -> None:
+    file = tmp_path / "mine.toml"
+    file.write_text("[match]\nmax_depth_mm = 900\n[detect]\npolarity = 'dark'\n", encoding="utf-8")
+    printed = trifix("config", "--config", file, "--set", "detect.polarity=bright").stdout
+    assert "max_depth_mm = 900.0\n" in printed
+    assert 'polarity = "bright"\n' in printed
+    file.write_text(printed, encoding="utf-8")
+    assert trifix("config", "--config", file).stdout == printed
+
+
+def test_a_run_writes_its_results_and_says_what_it_found(tmp_path: Path) -> None:
+    done = trifix("run", SMALL / "recording", "-o", tmp_path / "results")
+    assert done.returncode == 0, done.stderr
+    assert "positioned" in done.stdout
+    assert "noise" in done.stdout
+    assert "report.html" in done.stdout.replace("\n", "")
+    assert (tmp_path / "results" / "report.html").stat().st_size > 1000
+
+
+def test_results_are_compared_with_the_truth(results: Path) -> None:
+    done = trifix("evaluate", results, SMALL / "truth")
+    assert done.returncode == 0, done.stderr
+    assert "misidentified" in done.stdout
+
+
+def test_a_given_map_is_left_as_it_is(results: Path, tmp_path: Path) -> None:
+    done = trifix(
+        "run", SMALL / "recording", "-o", tmp_path / "again", "--map", results / "map.csv", "--map-mode", "frozen"
+    )
+    assert done.returncode == 0, done.stderr
+    assert rows(tmp_path / "again" / "map.csv", "id") == rows(results / "map.csv", "id")
+
+
+def test_the_same_recording_gives_the_same_bytes(results: Path, tmp_path: Path) -> None:
+    assert trifix("run", SMALL / "recording", "-o", tmp_path / "again").returncode == 0
+    names = sorted(path.name for path in results.iterdir() if path.is_file())
+    assert names == sorted(path.name for path in (tmp_path / "again").iterdir() if path.is_file())
+    for name in set(names) - {"timings.csv", "summary.json", "report.html"}:
+        assert (results / name).read_bytes() == (tmp_path / "again" / name).read_bytes(), name
+
+
+def test_a_folder_that_cannot_be_made_is_one_sentence(tmp_path: Path) -> None:
+    (tmp_path / "file").touch()
+    done = trifix("run", SMALL / "recording", "-o", tmp_path / "file" / "results")
+    assert done.returncode == 1
+    assert str(tmp_path / "file") in done.stderr
+    assert "Traceback" not in done.stderr
+
+
+def test_a_reader_that_goes_away_is_no_crash() -> None:
+    process = subprocess.Popen(command("config"), stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    assert process.stdout is not None
+    assert process.stderr is not None
+    process.stdout.close()
+    assert process.stderr.read() == "trifix: whoever read the output has gone, so not all of it was printed.\n"
+    assert process.wait() == 1
+
+
+@pytest.mark.parametrize("sent", [signal.SIGINT, signal.SIGTERM])
+def test_an_interrupted_run_leaves_whole_lines_and_code_130(sent: signal.Signals, tmp_path: Path) -> None:
+    assert trifix("simulate", "head", "-o", tmp_path, "--frames", 1500, "--level", "points").returncode == 0
+    out = tmp_path / "results"
+    process = subprocess.Popen(
+        command("run", tmp_path / "recording", "-o", out), stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    )
+    while process.poll() is None and (not (out / "frames.csv").exists() or len(lines(out / "frames.csv")) < 20):
+        time.sleep(0.02)
+    process.send_signal(sent)
+    _, stderr = process.communicate()
+    assert process.returncode == 130, stderr
+    assert "interrupted" in stderr
+    assert "Traceback" not in stderr
+    frames = rows(out / "frames.csv", "frame", "status")
+    assert 20 <= len(frames) < 1500
+    positioned = [frame for frame, status in frames if status == "positioned"]
+    assert rows(out / "poses.csv", "frame") == [(frame,) for frame in positioned]
+
+
+def test_the_first_example_runs(results: Path, tmp_path: Path) -> None:
+    assert results.exists()
+    shutil.copytree(SMALL, tmp_path / "demo")
+    example = Path(__file__).parent.parent / "examples" / "00_first_fix.py"
+    done = subprocess.run([sys.executable, example], cwd=tmp_path, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    assert "residual" in done.stdout
+
+
+def test_the_readme_shows_the_first_example() -> None:
+    root = Path(__file__).parent.parent
+    code = (root / "examples" / "00_first_fix.py").read_text(encoding="utf-8").split('"""', 2)[2].strip()
+    assert f"```python\n{code}\n```" in (root / "README.md").read_text(encoding="utf-8")
+
+
+def lines(path: Path) -> list[str]:
+    return path.read_text(encoding="utf-8").splitlines()
+
+
+def rows(path: Path, *columns: str) -> list[tuple[str, ...]]:
+    """Columns of a table, each of whose lines must be whole."""
+    text = path.read_text(encoding="utf-8")
+    assert text.endswith("\n")
+    table = list(csv.DictReader(text.splitlines()))
+    assert all(None not in row and None not in row.values() for row in table)
+    return [tuple(row[column] for column in columns) for row in table]
