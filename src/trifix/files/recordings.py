@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Literal, Protocol
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 
 from trifix.errors import CalibrationError, RecordingError
 from trifix.files.calibrations import read_rig
@@ -19,9 +19,11 @@ from trifix.files.images import ImagePairs, holds_images, read_image_pairs
 from trifix.files.tables import (
     COVARIANCE,
     LINE,
+    Table,
     fixed,
     from_upper_triangle,
     read_table,
+    refuse_where,
     significant,
     upper_triangle,
     write_table,
@@ -36,8 +38,6 @@ LEVELS: tuple[Level, ...] = ("images", "dots", "points")
 
 _LATERAL_PER_MM = 1e-3  # sigma of a point across its ray, without a rig: as seen with a focal length of 1000 px
 _LENGTHENING = 5.0  # and along the ray, in units of that
-
-Table = Mapping[str, np.ndarray]
 
 
 class Source(Protocol):
@@ -76,7 +76,8 @@ class Recording:
         return (self.frame(k) for k in range(len(self)))
 
     def frame(self, k: int) -> Frame:
-        """The k-th frame, counted from 0 whatever its index."""
+        """The k-th frame, counted from 0 whatever its index; negative counts from the end."""
+        k = range(len(self))[k]
         rig = self.rigs.get(k, self.rig)
         stamp = int(self.timestamp_ns[k])
         if rig is None and self.level != "points":
@@ -152,11 +153,11 @@ def _open_dots(path: Path, sigma_px: float) -> Recording:
     )
     position = _positions(file, table, index, timestamp_ns)
     camera = table["camera"]
-    _refuse_where((camera != 0) & (camera != 1), file, table, "camera", "0 (left) or 1 (right)")
+    refuse_where((camera != 0) & (camera != 1), file, table, "camera", "0 (left) or 1 (right)")
     _all_or_none(file, table, ("a_px", "b_px", "theta_rad"))
     for name in ("sigma_px", "diameter_px", "a_px", "b_px"):
         if name in table:
-            _refuse_where(table[name] <= 0, file, table, name, "a positive number")
+            refuse_where(table[name] <= 0, file, table, name, "a positive number")
     is_noise_stated = "sigma_px" in table
     n = len(position)
     sigma = table["sigma_px"] if is_noise_stated else np.full(n, sigma_px)
@@ -197,7 +198,7 @@ def _open_points(path: Path, sigma_px: float) -> Recording:
         finite = np.isfinite(cov).all(axis=(1, 2))
         smallest = np.ones(n)
         smallest[finite] = np.linalg.eigvalsh(cov[finite])[:, 0]
-        _refuse_where(smallest <= 0, file, table, "xx", "a covariance xx ... zz that is positive definite")
+        refuse_where(smallest <= 0, file, table, "xx", "a covariance xx ... zz that is positive definite")
     else:  # a default grows with the distance: it needs one
         for row in np.flatnonzero(table["z_mm"] <= 0):
             found = f"{file.name}, line {table[LINE][row]}, column 'z_mm': found {table['z_mm'][row]}"
@@ -362,7 +363,7 @@ def _positions(
     """Position in the recording of the frame of each row."""
     frame = table["frame"]
     position = np.searchsorted(index, frame).clip(max=len(index) - 1)
-    _refuse_where(index[position] != frame, file, table, "frame", "a frame of frames.csv")
+    refuse_where(index[position] != frame, file, table, "frame", "a frame of frames.csv")
     other = np.flatnonzero(timestamp_ns[position] != table["timestamp_ns"])
     if len(other):
         row = other[0]
@@ -371,15 +372,6 @@ def _positions(
             f"frames.csv it has {timestamp_ns[position[row]]}."
         )
     return np.asarray(position)
-
-
-def _refuse_where(wrong: Bool[np.ndarray, "m"], file: Path, table: Table, name: str, expected: str) -> None:
-    """Refuses the first row that is wrong."""
-    if wrong.any():
-        row = int(wrong.argmax())
-        raise RecordingError(
-            f"{file}, line {table[LINE][row]}, column '{name}': found {table[name][row]}, expected {expected}."
-        )
 
 
 def _all_or_none(file: Path, table: Table, names: tuple[str, ...]) -> bool:

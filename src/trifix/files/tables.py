@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import NoReturn
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from trifix.errors import RecordingError, TrifixError
 
@@ -22,6 +22,9 @@ COVARIANCE = ("xx", "xy", "xz", "yy", "yz", "zz")
 
 LINE = "#line"
 """Under this name a table holds the line of the file that each of its rows stands in, for later complaints."""
+
+Table = Mapping[str, np.ndarray]
+"""Columns by name, and ``LINE``."""
 
 _EXPECTED: Mapping[type, str] = {float: "a finite number", int: "an integer", str: "text"}
 _UNKNOWN: Mapping[type, str] = {float: "nan", int: "-1"}
@@ -71,6 +74,24 @@ def read_bare_table(
     """
     rows = _rows(path, delimiter, error)
     return _columns(path, rows, list(columns), columns, frozenset(), frozenset(), error)
+
+
+def refuse_where(
+    wrong: Bool[np.ndarray, "n"],
+    path: Path,
+    table: Table,
+    name: str,
+    expected: str,
+    error: type[TrifixError] = RecordingError,
+) -> None:
+    """Refuses the first wrong value of a column, if there is one.
+
+    Raises:
+        error: with file, line, column, what was found and what was expected.
+    """
+    if wrong.any():
+        row = int(wrong.argmax())
+        raise error(f"{path}, line {table[LINE][row]}, column '{name}': found {table[name][row]}, expected {expected}.")
 
 
 def write_table(path: Path, columns: Mapping[str, Sequence[str]]) -> None:
