@@ -3,7 +3,7 @@
 Knows float32 images and numbers; which blob is worth being called a dot is decided by the stage.
 """
 
-from math import atan2, cos, erfc, exp, log, pi, sqrt
+from math import atan2, erfc, exp, log, pi, sqrt
 
 import numpy as np
 from jaxtyping import Float
@@ -25,6 +25,7 @@ _LOG_BLUR = 0.8  # spread of the edge's blur about _BLUR_PX
 _BLUR_PX = 0.8
 _MIN_BLUR_PX = 0.29  # the pixel's own aperture: 1/sqrt(12)
 _QUANTISATION_VARIANCE = 1.0 / 12.0
+_ENOUGH = 400  # pixels for the first, rough fit
 
 
 @njit(cache=True, nogil=True)
@@ -40,8 +41,8 @@ def blobs(
     image: Float[np.ndarray, "h w"],
     threshold: Float[np.ndarray, "h w"],
     sign: float,
-    min_area_px2: float,
-    max_width_px: float,
+    min_diameter_px: float,
+    max_diameter_px: float,
     min_axis_ratio: float,
     min_fill: float,
 ) -> Float[np.ndarray, "m 6"]:
@@ -105,15 +106,15 @@ def blobs(
         sums[k, 4] += su * row[i]
         sums[k, 5] += m * row[i] * row[i]
 
+    min_area_px2 = max(pi / 4 * min_diameter_px**2, 4.0)
+    max_area_px2 = pi / 4 * max_diameter_px**2
     out = np.empty((n, 6))
     found = 0
     for k in range(n):
         area = sums[k, 0]
-        if parent[k] != k or area < min_area_px2:
+        if parent[k] != k or area < min_area_px2 or area > max_area_px2:
             continue
         if box[k, 0] == 0 or box[k, 2] == 0 or box[k, 1] == w - 1 or box[k, 3] == h - 1:
-            continue
-        if max(box[k, 1] - box[k, 0], box[k, 3] - box[k, 2]) >= max_width_px:
             continue
         u_mean, v_mean = sums[k, 1] / area, sums[k, 2] / area
         uu = sums[k, 3] / area - u_mean * u_mean + 1 / 12
@@ -132,10 +133,9 @@ def blobs(
 
 
 @njit(cache=True, nogil=True)
-def _solve(H: np.ndarray, g: np.ndarray, damping: float, L: np.ndarray, x: np.ndarray) -> bool:
-    """Solves (H + damping·diag H) x = g by Cholesky; the factor stays in L. False where it is not positive."""
-    n = len(g)
-    for i in range(n):
+def _factor(H: np.ndarray, damping: float, L: np.ndarray) -> bool:
+    """Cholesky factor L of H + damping·diag H, of which the lower triangle is read; False if not positive."""
+    for i in range(_N):
         for j in range(i + 1):
             s = H[i, j]
             if i == j:
@@ -148,17 +148,38 @@ def _solve(H: np.ndarray, g: np.ndarray, damping: float, L: np.ndarray, x: np.nd
                 L[i, i] = sqrt(s)
             else:
                 L[i, j] = s / L[j, j]
-    for i in range(n):
+    return True
+
+
+@njit(cache=True, nogil=True)
+def _solve(H: np.ndarray, g: np.ndarray, damping: float, L: np.ndarray, x: np.ndarray) -> bool:
+    """Solves (H + damping·diag H) x = g, with L as storage; False where there is no solution."""
+    if not _factor(H, damping, L):
+        return False
+    for i in range(_N):
         s = g[i]
         for k in range(i):
             s -= L[i, k] * x[k]
         x[i] = s / L[i, i]
-    for i in range(n - 1, -1, -1):
+    for i in range(_N - 1, -1, -1):
         s = x[i]
-        for k in range(i + 1, n):
+        for k in range(i + 1, _N):
             s -= L[k, i] * x[k]
         x[i] = s / L[i, i]
     return True
+
+
+@njit(cache=True, nogil=True)
+def _leading_inverse(L: np.ndarray) -> tuple[float, float, float]:
+    """Entries 00, 01, 11 of (LLᵀ)⁻¹: products of the first columns of L⁻¹."""
+    a, b = np.zeros(_N), np.zeros(_N)
+    for i in range(_N):
+        s, t = 1.0 if i == 0 else 0.0, 1.0 if i == 1 else 0.0
+        for k in range(i):
+            s -= L[i, k] * a[k]
+            t -= L[i, k] * b[k]
+        a[i], b[i] = s / L[i, i], t / L[i, i]
+    return float(np.sum(a * a)), float(np.sum(a * b)), float(np.sum(b * b))
 
 
 @njit(cache=True, nogil=True)
@@ -195,6 +216,21 @@ def _gather(
 
 
 @njit(cache=True, nogil=True)
+def _thin(pixels: np.ndarray, n: int) -> int:
+    """Keeps about _ENOUGH of the first n pixels, evenly."""
+    stride = n // _ENOUGH
+    if stride < 2:
+        return n
+    # An odd stride does not fall into step with rows of even length.
+    stride |= 1
+    kept = 0
+    for i in range(0, n, stride):
+        pixels[kept] = pixels[i]
+        kept += 1
+    return kept
+
+
+@njit(cache=True, nogil=True)
 def _normal_equations(
     pixels: np.ndarray,
     n: int,
@@ -228,6 +264,7 @@ def _normal_equations(
         step = x[9] + x[10] * eu + x[11] * ev
         inside = 0.0 if z > 4 else 1.0
         start = 6
+        J[0] = J[1] = J[2] = J[3] = J[4] = J[5] = 0.0
         if -4 < z < 4:
             start = 0
             inside = 0.5 * erfc(z / sqrt(2.0))
@@ -239,11 +276,11 @@ def _normal_equations(
         J[9], J[10], J[11] = inside, inside * eu, inside * ev
         residual = pixels[k, 2] - (x[6] + x[7] * eu + x[8] * ev + inside * step)
         total += residual * residual
-        stop = _N if inside > 0 else 9
-        for i in range(start, stop):
-            g[i] += J[i] * residual
-            for j in range(start, i + 1):
-                H[i, j] += J[i] * J[j]
+        for i in range(start, _N):
+            Ji = J[i]
+            g[i] += Ji * residual
+            for j in range(i + 1):
+                H[i, j] += Ji * J[j]
 
     # Blur: log-normal.
     w = variance / _LOG_BLUR**2
@@ -279,120 +316,134 @@ def _normal_equations(
 
 
 @njit(cache=True, nogil=True)
+def _set_levels(pixels: np.ndarray, n: int, x: np.ndarray) -> bool:
+    """Starts the levels of surround and step from the pixels clear of the edge; False where there are none."""
+    around, inside, n_around, n_inside = 0.0, 0.0, 0, 0
+    for i in range(n):
+        y0 = x[2] * pixels[i, 0] + x[3] * pixels[i, 1]
+        y1 = x[4] * pixels[i, 1]
+        q2 = y0 * y0 + y1 * y1
+        if q2 < 0.8:
+            inside += pixels[i, 2]
+            n_inside += 1
+        elif q2 > 1.2:
+            around += pixels[i, 2]
+            n_around += 1
+    if n_inside == 0 or n_around == 0:
+        return False
+    x[6] = around / n_around
+    x[9] = inside / n_inside - x[6]
+    return True
+
+
+@njit(cache=True, nogil=True)
+def _descend(
+    pixels: np.ndarray,
+    n: int,
+    x: np.ndarray,
+    radius: float,
+    variance: float,
+    sign: float,
+    max_residual: float,
+    enough_px: float,
+    H: np.ndarray,
+) -> float:
+    """Levenberg-Marquardt from x, in place, until the centre moves less than ``enough_px``.
+
+    Returns the variance of the residuals (grey values²) and leaves JᵀJ in H; NaN where it leads nowhere.
+    """
+    H_new, L, g, g_new = np.empty((_N, _N)), np.zeros((_N, _N)), np.empty(_N), np.empty(_N)
+    dx, x_new = np.empty(_N), np.empty(_N)
+    damping, accepted = 1e-3, 0
+    cost = _normal_equations(pixels, n, x, radius, variance, H, g)
+    for _ in range(25):
+        if not _solve(H, g, damping, L, dx):
+            return np.nan
+        for i in range(_N):
+            x_new[i] = x[i] + dx[i]
+        x_new[5] = min(max(x_new[5], _MIN_BLUR_PX / radius, 0.5 * x[5]), 2 * x[5])
+        is_sane = x_new[2] > 0.1 and x_new[4] > 0.1 and x_new[0] ** 2 + x_new[1] ** 2 < 1 and sign * x_new[9] > 0
+        cost_new = cost
+        if is_sane:
+            cost_new = _normal_equations(pixels, n, x_new, radius, variance, H_new, g_new)
+        # The Jacobian holds to first order in the distance, so its fixed point lies a little beside the least sum: a
+        # small rise is no reason to turn back.
+        if not is_sane or cost_new > 1.02 * cost:
+            damping = 10 * damping + 1e-2
+            if damping > 1e4:
+                return np.nan
+            continue
+        move_px = max(abs(x_new[0] - x[0]), abs(x_new[1] - x[1])) * radius
+        x[:], H[:], g[:] = x_new, H_new, g_new
+        cost = cost_new
+        damping *= 0.1
+        accepted += 1
+        if move_px < enough_px:
+            return cost / (n - _N)
+        if accepted == 3 and cost > n * (2 * max_residual * x[9]) ** 2:
+            return np.nan
+    return np.nan
+
+
+@njit(cache=True, nogil=True)
 def fit_ellipses(
     image: Float[np.ndarray, "h w"],
     start: Float[np.ndarray, "m 5"],
-    sign: float,
     coarseness_px: Float[np.ndarray, "m"],
+    sign: float,
+    min_contrast: float,
+    max_residual: float,
 ) -> Float[np.ndarray, "m 12"]:
     """Least squares of a blurred ellipse to the grey values about each blob (see FIT_COLUMNS).
 
     ``start`` holds u, v, uu, uv, vv of the blobs; ``coarseness_px`` is how far off that may be. The covariance is
     that of least squares with the noise taken from the residuals: the Cramér-Rao bound where the model holds.
+    A fit is given up as soon as it is clear that its step (as a fraction of the brighter side) will stay well below
+    ``min_contrast`` or its residual (as a fraction of the step) well above ``max_residual``.
     """
-    h, w = image.shape
     out = np.full((len(start), 12), np.nan)
-    H, H_new, L = np.empty((_N, _N)), np.empty((_N, _N)), np.zeros((_N, _N))
-    g, g_new, dx, x, x_new = np.empty(_N), np.empty(_N), np.empty(_N), np.empty(_N), np.empty(_N)
+    H, L, x = np.empty((_N, _N)), np.zeros((_N, _N)), np.empty(_N)
     pixels = np.empty((1024, 3))
     for k in range(len(start)):
         u0, v0 = start[k, 0], start[k, 1]
         # A uniform ellipse with form E has second moments E/4; A is the factor of E⁻¹ = AᵀA, in radii.
         uu, uv, vv = 4 * start[k, 2], 4 * start[k, 3], 4 * start[k, 4]
-        det = uu * vv - uv * uv
-        radius = det**0.25
-        scale = radius * radius / det
+        radius = (uu * vv - uv * uv) ** 0.25
         x[:] = 0.0
-        x[2] = sqrt(vv * scale)
-        x[3] = -uv * scale / x[2]
-        x[4] = sqrt(uu * scale - x[3] * x[3])
+        x[2] = sqrt(vv) / radius
+        x[3] = -uv / (radius * radius) / x[2]
+        x[4] = sqrt(uu / (radius * radius) - x[3] * x[3])
         x[5] = _BLUR_PX / radius
-        ok = False
-        variance = 1.0
-        for stage in range(2):
-            margin = 3.0 + (coarseness_px[k] if stage == 0 else 3 * max(0.0, x[5] * radius - 0.5))
-            outer, inner = margin / radius, (margin + 2.0) / radius
-            if radius < 8:
-                inner = 1e9
+        is_rough = coarseness_px[k] > 0
+        variance, margin, needed = np.nan, 0.0, 3.0 + coarseness_px[k]
+        # Again where the edge proves to lie or to reach elsewhere than the window was laid for.
+        for attempt in range(3):
+            margin = needed
             room = int((2 * (sqrt(max(uu, vv)) + margin) + 6) ** 2)
             if room > len(pixels):
                 pixels = np.empty((room, 3))
-            n = _gather(image, u0, v0, radius, x, outer, inner, pixels)
-            if n < 2 * _N:
-                break
-            if stage == 0:
-                level_out, level_in, n_in = 0.0, 0.0, 0
-                for i in range(n):
-                    y0 = x[2] * pixels[i, 0] + x[3] * pixels[i, 1]
-                    y1 = x[4] * pixels[i, 1]
-                    if y0 * y0 + y1 * y1 < 0.8:
-                        level_in += pixels[i, 2]
-                        n_in += 1
-                    elif y0 * y0 + y1 * y1 > 1.2:
-                        level_out += pixels[i, 2]
-                if n_in == 0:
+            inner = (margin + 2) / radius if radius > 8 else np.inf
+            n = _gather(image, u0, v0, radius, x, margin / radius, inner, pixels)
+            if is_rough:
+                n = _thin(pixels, n)
+            if attempt == 0:
+                if n < 2 * _N or not _set_levels(pixels, n, x):
                     break
-                n_out = 0
-                for i in range(n):
-                    y0 = x[2] * pixels[i, 0] + x[3] * pixels[i, 1]
-                    y1 = x[4] * pixels[i, 1]
-                    if y0 * y0 + y1 * y1 > 1.2:
-                        n_out += 1
-                if n_out == 0:
-                    break
-                x[6] = level_out / n_out
-                x[9] = level_in / n_in - x[6]
-                if sign * x[9] <= 0:
+                if sign * x[9] < 0.5 * min_contrast * max(x[6], x[6] + x[9]):
                     break
                 variance = max(1.0, 0.01 * x[9] * x[9])
-            ok = False
-            damping = 1e-3
-            cost = _normal_equations(pixels, n, x, radius, variance, H, g)
-            for _ in range(6 if stage == 0 else 20):
-                if not _solve(H, g, damping, L, dx):
-                    break
-                for i in range(_N):
-                    x_new[i] = x[i] + dx[i]
-                x_new[5] = min(max(x_new[5], _MIN_BLUR_PX / radius, 0.5 * x[5]), 2 * x[5])
-                if x_new[2] < 0.1 or x_new[4] < 0.1 or x_new[0] ** 2 + x_new[1] ** 2 > 1 or sign * x_new[9] <= 0:
-                    damping = 10 * damping + 1e-2
-                    if damping > 1e4:
-                        break
-                    continue
-                cost_new = _normal_equations(pixels, n, x_new, radius, variance, H_new, g_new)
-                # The Jacobian holds to first order in the distance, so its fixed point lies a little beside the
-                # least sum: a small rise is no reason to turn back.
-                if cost_new > 1.02 * cost:
-                    damping = 10 * damping + 1e-3
-                    if damping > 1e4:
-                        break
-                    continue
-                move = max(abs(x_new[0] - x[0]), abs(x_new[1] - x[1])) * radius
-                x, x_new = x_new, x
-                H, H_new = H_new, H
-                g, g_new = g_new, g
-                cost = cost_new
-                damping *= 0.1
-                if (stage == 0 and move < 0.05) or move < 5e-4:
-                    ok = True
-                    break
-            if stage == 0:
-                ok = True
-            # The prior's share of the cost is of the order of the variance itself: negligible in the sum.
-            variance = max(cost / (n - _N), _QUANTISATION_VARIANCE)
-        if not ok:
+            enough_px = 0.1 if is_rough else 5e-4
+            variance = _descend(pixels, n, x, radius, variance, sign, max_residual, enough_px, H)
+            if not variance >= 0:
+                break
+            variance = max(variance, _QUANTISATION_VARIANCE)
+            needed = 3.0 + 3.0 * max(0.0, x[5] * radius - 0.8)
+            if not is_rough and needed < margin + 1:
+                break
+            is_rough = False
+        if not variance >= 0 or not _factor(H, 0.0, L):
             continue
-        # Rows of the inverse: cov = variance · H⁻¹; H holds the lower triangle.
-        if not _solve(H, g, 0.0, L, dx):
-            continue
-        g_new[:] = 0.0
-        g_new[0] = 1.0
-        _solve(H, g_new, 0.0, L, dx)
-        c_uu, c_uv = dx[0], dx[1]
-        g_new[0] = 0.0
-        g_new[1] = 1.0
-        _solve(H, g_new, 0.0, L, dx)
-        c_vv = dx[1]
+        c_uu, c_uv, c_vv = _leading_inverse(L)
         unit = variance * radius * radius
         p, r, t = x[2], x[3], x[4]
         # Form of the ellipse E = (AᵀA)⁻¹ and its eigenvalues a², b².
@@ -402,7 +453,7 @@ def fit_ellipses(
         out[k, 0], out[k, 1] = u0 + x[0] * radius, v0 + x[1] * radius
         out[k, 2], out[k, 3], out[k, 4] = unit * c_uu, unit * c_uv, unit * c_vv
         out[k, 5] = radius * sqrt(mean + spread)
-        out[k, 6] = radius * sqrt(max(mean - spread, 1e-12))
+        out[k, 6] = radius * sqrt(max(mean - spread, 0.0))
         out[k, 7] = 0.5 * atan2(2 * e_uv, e_uu - e_vv)
         out[k, 8] = x[5] * radius
         out[k, 9], out[k, 10], out[k, 11] = x[6], x[9], sqrt(variance)
@@ -413,5 +464,5 @@ def warm_up() -> None:
     """Compiles every kernel of this module for the types with which the stage calls it."""
     v, u = np.mgrid[0:24, 0:24]
     image = np.where((u - 12) ** 2 + (v - 12) ** 2 < 20, 50.0, 200.0).astype(np.float32)
-    found = blobs(image, np.full_like(image, 128.0), -1.0, 4.0, 20.0, 0.3, 0.7)
-    fit_ellipses(image, found[:, :5].copy(), -1.0, np.zeros(len(found)))
+    found = blobs(image, np.full_like(image, 128.0), -1.0, 3.0, 20.0, 0.3, 0.7)
+    fit_ellipses(image, found[:, :5].copy(), np.zeros(len(found)), -1.0, 0.2, 0.12)

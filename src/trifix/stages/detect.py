@@ -14,9 +14,9 @@ from trifix.kernels.detection import blobs, fit_ellipses
 from trifix.records import Dots, GreyOrColour
 
 _SIGN = {"dark": -1.0, "bright": 1.0}
-# A level of the pyramid answers for blobs from 5 to 12 of its own pixels across (the finest also for smaller ones);
+# A level of the pyramid answers for blobs from 6 to 14 of its own pixels across (the finest also for smaller ones);
 # the limits overlap, since a dot may be measured a little larger or smaller from one level to the next.
-_LEVEL_MIN_PX, _LEVEL_MAX_PX, _WINDOW_PX = 5.0, 14.0, 25
+_LEVEL_MIN_PX, _LEVEL_MAX_PX, _WINDOW_PX = 6.0, 14.0, 25
 _MIN_FILL = 0.75
 
 
@@ -32,7 +32,7 @@ class DetectOptions:
     """Largest diameter of a dot (px)."""
     min_axis_ratio: float = 0.34
     """Least ratio of the short axis to the long one; a round target tilted by 70 degrees shows 0.34."""
-    min_contrast: float = 0.15
+    min_contrast: float = 0.2
     """Least step at the dot's edge, as a fraction of the brighter side."""
     max_residual: float = 0.12
     """Largest rms residual of the fitted ellipse, as a fraction of the step; lower refuses more clutter."""
@@ -46,7 +46,10 @@ def detect(image: GreyOrColour, options: DetectOptions) -> Dots:
     """
     grey = np.ascontiguousarray(cv2.cvtColor(image, cv2.COLOR_BGR2GRAY) if image.ndim == 3 else image, np.float32)
     if options.polarity == "auto":
-        fits = max((_fits(grey, sign, options) for sign in _SIGN.values()), key=_evidence)
+        fits = max(
+            (_fits(grey, sign, options) for sign in _SIGN.values()),
+            key=lambda fits: _evidence(fits, options.max_residual),
+        )
     else:
         fits = _fits(grey, _SIGN[options.polarity], options)
     fits = fits[np.lexsort((fits[:, 0], fits[:, 1]))]
@@ -58,7 +61,7 @@ def detect(image: GreyOrColour, options: DetectOptions) -> Dots:
 def _fits(grey: Float[np.ndarray, "h w"], sign: float, options: DetectOptions) -> Float[np.ndarray, "n 12"]:
     """Accepted fits of one polarity."""
     start, coarseness = _candidates(grey, sign, options)
-    fits = fit_ellipses(grey, start, sign, coarseness)
+    fits = fit_ellipses(grey, start, coarseness, sign, options.min_contrast, options.max_residual)
     fits = fits[np.isfinite(fits[:, 0])]
     u, v, a, b = fits[:, 0], fits[:, 1], fits[:, 5], fits[:, 6]
     around, step, residual = fits[:, 9], np.abs(fits[:, 10]), fits[:, 11]
@@ -105,8 +108,8 @@ def _candidates(
                 level,
                 threshold,
                 sign,
-                max(np.pi / 4 * least**2, 4.0),
-                _LEVEL_MAX_PX / np.sqrt(options.min_axis_ratio),
+                least,
+                _LEVEL_MAX_PX,
                 options.min_axis_ratio * 0.9,
                 _MIN_FILL,
             )
@@ -126,6 +129,10 @@ def _threshold(level: Float[np.ndarray, "h w"], sign: float, min_contrast: float
     return np.asarray(np.where(is_edged, 0.5 * (darkest + brightest), np.float32(sign * np.inf)), dtype=np.float32)
 
 
-def _evidence(fits: Float[np.ndarray, "n 12"]) -> float:
-    """How much a set of fits looks like a set of targets."""
-    return float(np.sum(np.abs(fits[:, 10]) / fits[:, 11]))
+def _evidence(fits: Float[np.ndarray, "n 12"], max_residual: float) -> float:
+    """How much a set of fits looks like targets: each counts by how far its residual stays below the limit.
+
+    Clutter that passes does so narrowly, a target leaves hardly more than noise; the square of the margin keeps many
+    of the one from outvoting a few of the other.
+    """
+    return float(np.sum((1 - fits[:, 11] / (max_residual * np.abs(fits[:, 10]))) ** 2))
