@@ -1,0 +1,314 @@
+"""The results folder, written as Steps pass and usable whenever the process dies. Decides nothing, draws nothing.
+
+Rows wait in memory for a quarter of a second at most; then a thread appends them to their files in blocks of whole
+lines, one write a file, so that a slow frame holds no row back. ``frames.csv`` comes last in each round: the rows of
+the frames that it names stand in all other files already. Map and summary are replaced, never rewritten in place.
+Nothing depends on the clock but timings.csv and summary.json.
+"""
+
+import threading
+import time
+from itertools import chain
+from pathlib import Path
+from types import TracebackType
+from typing import Self
+
+import msgspec
+import numpy as np
+from jaxtyping import Float
+
+from trifix.errors import RecordingError
+from trifix.files.maps import write_map, write_ply
+from trifix.files.recordings import DOTS_HEADER, Level, dots_rows
+from trifix.files.tables import fixed, significant, write_atomically
+from trifix.files.trajectories import POSES_HEADER, poses_row, tum_row
+from trifix.geometry.camera import Camera
+from trifix.outputs.summary import Summary, Tally
+from trifix.records import Fix, NoFix, Reason, ReferenceMap, Step
+
+FLUSH_S = 0.25
+"""Longest wait of a row in memory (s)."""
+CHECKPOINT_S = 5.0
+"""Longest wait of a changed map in memory (s)."""
+STAGES = ("detect", "match", "triangulate", "identify", "orient", "verify", "update")
+"""Columns of timings.csv, in the order of the work."""
+
+_POSE = "x_mm,y_mm,z_mm,qx,qy,qz,qw"
+# In the order in which they are written.
+_HEADERS = {
+    "dots.csv": DOTS_HEADER,
+    "sightings.csv": "frame,kind,row,target,residual_mm,residual_px",
+    "events.csv": "frame,timestamp_ns,event,target,detail",
+    "rivals.csv": f"frame,timestamp_ns,rival,{_POSE},log_odds,odds_to_best,matched",
+    "timings.csv": "frame," + ",".join(f"{stage}_ms" for stage in STAGES) + ",total_ms",
+    "poses.csv": POSES_HEADER,
+    "trajectory.tum": "",
+    "frames.csv": "frame,timestamp_ns,status,reason,dots_left,dots_right,points,matched,residual_mm,p_chance,detail",
+}
+_REPLACED = ("map.csv", "map.ply", "report.html")
+
+
+class ResultsWriter:
+    """Writes Steps into a results folder.
+
+    with ResultsWriter(out, "my recording", "dots", to_toml(config), is_online=True) as results:
+        for step in positioner.run(recording):
+            results.write(step)
+        summary = results.finish()
+
+    Without ``finish``, as after an exception, the files are closed whole and the summary says ``finished: false``.
+    """
+
+    def __init__(self, out: Path, recording_name: str, level: Level, config_toml: str, is_online: bool) -> None:
+        self._out = out
+        self._level = level
+        self._tally = Tally(recording_name, level, config_toml, is_online)
+        self._map = ReferenceMap.empty()
+        self._dots_written = 0
+        self._waiting: list[dict[str, list[str]]] = []
+        self._is_finished = False
+        self._failure: OSError | None = None
+        self._lock = threading.Lock()  # held for moments: between the loop, which fills, and the thread, which empties
+        self._closing = threading.Event()
+        self._thread = threading.Thread(target=self._keep_writing, name="results", daemon=True)
+
+    def __enter__(self) -> Self:
+        """Make the folder, or empty it of an earlier run's results.
+
+        Raises:
+            RecordingError: the folder holds something else, or cannot be written.
+        """
+        try:
+            _clear(self._out)
+            self._start = time.monotonic()
+            self._write_state()
+            self._logs = {
+                name: _Log(self._out / name, header)
+                for name, header in _HEADERS.items()
+                if name != "dots.csv" or self._level == "images"
+            }
+        except OSError as error:
+            raise RecordingError(f"{self._out}: results cannot be written there ({error.strerror}).") from error
+        self._thread.start()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
+    ) -> None:
+        self._close()
+
+    def write(self, step: Step) -> None:
+        """Take over the rows of one frame; they reach the disk within ``FLUSH_S``.
+
+        Raises:
+            RecordingError: earlier rows could not be written.
+        """
+        self._complain()
+        sightings, residual_px = self._sightings(step)
+        rows = {
+            "sightings.csv": sightings,
+            "events.csv": _event_rows(step),
+            "rivals.csv": _rival_rows(step),
+            "timings.csv": [_timing_row(step)],
+            "frames.csv": [_frame_row(step)],
+        }
+        if isinstance(step.fix, Fix):
+            pose, timestamp_ns = step.fix.T_world_sensor, step.frame.timestamp_ns
+            rows["poses.csv"] = [poses_row(step.frame.index, timestamp_ns, pose, step.fix.cov)]
+            rows["trajectory.tum"] = [tum_row(timestamp_ns, pose)]
+        if self._level == "images" and step.dots is not None:
+            rows["dots.csv"] = dots_rows(step.frame.index, step.frame.timestamp_ns, step.dots)
+            self._dots_written += len(rows["dots.csv"])
+        targets = step.map.copy()
+        with self._lock:
+            self._waiting.append(rows)
+            self._map = targets
+            self._tally.add(step, residual_px)
+
+    def finish(self) -> Summary:
+        """Close the files of a run that reached its end; what it amounts to.
+
+        Raises:
+            RecordingError: something could not be written.
+        """
+        self._is_finished = True
+        self._close()
+        self._complain()
+        return self._summary
+
+    def _close(self) -> None:
+        self._closing.set()
+        self._thread.join()
+        for log in self._logs.values():
+            log.close()
+
+    def _complain(self) -> None:
+        if self._failure is not None:
+            raise RecordingError(
+                f"{self._out}: results cannot be written there ({self._failure.strerror}); what stands there is whole."
+            ) from self._failure
+
+    def _keep_writing(self) -> None:
+        """The thread: everything that is written after the start is written here."""
+        checkpoint = self._start
+        try:
+            while not self._closing.wait(FLUSH_S):
+                self._flush()
+                if time.monotonic() - checkpoint > CHECKPOINT_S:
+                    checkpoint = time.monotonic()
+                    self._write_state()
+            self._flush()
+            self._write_state()
+        except OSError as error:
+            self._failure = error
+
+    def _flush(self) -> None:
+        with self._lock:
+            waiting, self._waiting = self._waiting, []
+        if waiting:
+            for name, log in self._logs.items():
+                log.append("".join(f"{row}\n" for row in chain.from_iterable(rows.get(name, ()) for rows in waiting)))
+
+    def _write_state(self) -> None:
+        with self._lock:
+            targets = self._map
+            self._summary = self._tally.summary(
+                targets, time.monotonic() - self._start, finished=self._is_finished and self._closing.is_set()
+            )
+        write_map(targets, self._out / "map.csv")
+        write_ply(targets, self._out / "map.ply")
+        summary = msgspec.json.format(msgspec.json.encode(self._summary), indent=2).decode()
+        write_atomically(self._out / "summary.json", summary + "\n")
+
+    def _sightings(self, step: Step) -> tuple[list[str], Float[np.ndarray, "d"]]:
+        """Rows of sightings.csv, and how far identified dots are from their reprojected targets (px)."""
+        fix, points = step.fix, step.points
+        if not isinstance(fix, Fix) or points is None:
+            return [], np.zeros(0)
+        frame, ids = step.frame.index, step.map.id[fix.target]
+        mm = [fixed(value) for value in fix.residual_mm]
+        if step.dots is None or step.matches is None or step.frame.rig is None:
+            rows = points.row[fix.point]
+            return [f"{frame},point,{r},{i},{e}," for r, i, e in zip(rows, ids, mm, strict=True)], np.zeros(0)
+        rig, match = step.frame.rig, points.match[fix.point]
+        in_left = fix.T_world_sensor.inverse().apply(step.map.xyz_mm[fix.target])
+        left, right = step.matches.left[match], step.matches.right[match]
+        px_left = _distance_px(rig.left, in_left, step.dots.left.uv_px[left])
+        px_right = _distance_px(rig.right, rig.T_right_left.apply(in_left), step.dots.right.uv_px[right])
+        if self._level == "images":  # rows of the dots.csv among the results
+            row_left, row_right = self._dots_written + left, self._dots_written + len(step.dots.left) + right
+        else:
+            row_left, row_right = step.dots.left.row[left], step.dots.right.row[right]
+        sightings = []
+        for k, target in enumerate(ids):
+            sightings.append(f"{frame},left,{row_left[k]},{target},{mm[k]},{fixed(px_left[k])}")
+            sightings.append(f"{frame},right,{row_right[k]},{target},{mm[k]},{fixed(px_right[k])}")
+        return sightings, np.concatenate([px_left, px_right])
+
+
+class _Log:
+    """A file that grows by whole lines."""
+
+    def __init__(self, path: Path, header: str) -> None:
+        self._file = path.open("wb", buffering=0)
+        self._length = 0
+        self.append(f"{header}\n" if header else "")
+
+    def append(self, lines: str) -> None:
+        """Write lines in one go; where not all of them fit, none stays.
+
+        Raises:
+            OSError: the disk is full, or worse.
+        """
+        block = lines.encode()
+        try:
+            written = 0
+            while written < len(block):
+                written += self._file.write(block[written:])
+        except OSError:
+            self._file.truncate(self._length)
+            raise
+        self._length += len(block)
+
+    def close(self) -> None:
+        self._file.close()
+
+
+def _clear(out: Path) -> None:
+    """An existing folder without an earlier run's results, or a new one.
+
+    Raises:
+        RecordingError: it is no folder, or holds files of somebody else.
+    """
+    if out.exists() and not out.is_dir():
+        raise RecordingError(f"{out} is a file, expected a folder for the results: name another.")
+    out.mkdir(parents=True, exist_ok=True)
+    if any(out.iterdir()) and not _is_result(out):
+        raise RecordingError(f"{out} holds files that are not results of trifix: name a new or an empty folder.")
+    for folder in (out, *out.glob("islands/*")):
+        for name in (*_HEADERS, *_REPLACED):
+            (folder / name).unlink(missing_ok=True)
+
+
+def _is_result(out: Path) -> bool:
+    """Whether the folder's summary.json was written by trifix."""
+    try:
+        summary = msgspec.json.decode((out / "summary.json").read_bytes())
+    except (OSError, msgspec.DecodeError):
+        return False
+    return isinstance(summary, dict) and "trifix" in (summary.get("versions") or ())
+
+
+def _frame_row(step: Step) -> str:
+    frame, fix = step.frame, step.fix
+    left, right = (0, 0) if step.dots is None else (len(step.dots.left), len(step.dots.right))
+    counts = f"{left},{right},{0 if step.points is None else len(step.points)}"
+    match fix:
+        case Fix():
+            reason = "" if fix.reason is None else fix.reason.name
+            verdict, matched, residual_mm = f"positioned,{reason}", len(fix.point), fix.rms_mm
+        case NoFix():
+            verdict, matched, residual_mm = f"refused,{fix.why.name}", fix.matched, fix.residual_mm
+    numbers = f"{matched},{fixed(residual_mm)},{significant(fix.p_chance, 6)}"
+    return f"{frame.index},{frame.timestamp_ns},{verdict},{counts},{numbers},{_text(fix.detail)}"
+
+
+def _event_rows(step: Step) -> list[str]:
+    start = f"{step.frame.index},{step.frame.timestamp_ns}"
+    return [
+        f"{start},{each.event},{'' if each.target is None else each.target},{_text(each.detail)}"
+        for each in step.events
+    ]
+
+
+def _rival_rows(step: Step) -> list[str]:
+    if not isinstance(step.fix, NoFix) or step.fix.why is not Reason.ambiguous:
+        return []
+    start, rivals = f"{step.frame.index},{step.frame.timestamp_ns}", step.fix.rivals
+    best = max((each.log_odds for each in rivals), default=0.0)
+    rows = []
+    for rank, each in enumerate(rivals):
+        pose = each.T_world_sensor
+        numbers = ",".join([*map(fixed, pose.t_mm), *(fixed(q, 12) for q in pose.quaternion_xyzw)])
+        odds = f"{significant(each.log_odds)},{significant(np.exp(each.log_odds - best))}"
+        rows.append(f"{start},{rank},{numbers},{odds},{each.matched}")
+    return rows
+
+
+def _timing_row(step: Step) -> str:
+    ms = step.timings_ms
+    stages = ",".join(fixed(ms[stage], 3) if stage in ms else "" for stage in STAGES)
+    return f"{step.frame.index},{stages},{fixed(sum(ms.values()), 3)}"
+
+
+def _distance_px(
+    camera: Camera, xyz_mm: Float[np.ndarray, "n 3"], uv_px: Float[np.ndarray, "n 2"]
+) -> Float[np.ndarray, "n"]:
+    """Distances of dots from the images of points in the camera's coordinates; NaN for points behind it."""
+    return np.asarray(np.linalg.norm(camera.project(xyz_mm) - uv_px, axis=1))
+
+
+def _text(words: str) -> str:
+    """Free text as one cell of one line."""
+    line = " ".join(words.split())
+    return f'"{line.replace(chr(34), chr(34) * 2)}"' if "," in line or '"' in line else line

@@ -1,0 +1,172 @@
+"""What a whole run amounts to, in numbers, gathered as Steps pass. Knows neither files nor how they are shown."""
+
+import platform
+import tomllib
+from array import array
+from collections import Counter
+from dataclasses import dataclass
+from importlib.metadata import version
+
+import numpy as np
+from jaxtyping import Float
+
+from trifix.records import Fix, NoFix, ReferenceMap, Step, TargetState
+
+
+@dataclass(frozen=True, slots=True)
+class Residuals:
+    """How far the identified points or dots were from their targets."""
+
+    rms: float | None
+    """Root mean square over all of them; None if there are none."""
+    median: float | None
+    """Median over the frames of the root mean square within a frame."""
+    worst: float | None
+    """The largest root mean square within a frame."""
+    count: int
+    """How many there are."""
+
+
+@dataclass(frozen=True, slots=True)
+class Timing:
+    """How long one stage took."""
+
+    median_ms: float
+    """Median over the frames in which it ran (ms)."""
+    p99_ms: float
+    """99th percentile (ms)."""
+    frames: int
+    """Frames in which it ran."""
+
+
+@dataclass(frozen=True, slots=True)
+class Summary:
+    """A run in numbers: the content of summary.json."""
+
+    recording: str
+    """Name of the recording."""
+    level: str
+    """images, dots or points."""
+    is_online: bool
+    """Every frame was judged by what was known at its time."""
+    finished: bool
+    """The run reached its end; False while it goes on and after it was cut short."""
+    frames: int
+    """Frames judged."""
+    positioned: int
+    """Frames with a pose."""
+    refused: int
+    """Frames without."""
+    reasons: dict[str, int]
+    """Frames per reason: of refusals, and of what is special about a positioned frame."""
+    targets: dict[str, int]
+    """Targets per state."""
+    residual_mm: Residuals
+    """Distances of identified points from their targets (mm)."""
+    residual_px: Residuals
+    """Distances of identified dots from their reprojected targets (px); none if the recording begins with points."""
+    noise_scale: float
+    """Factor on all stated or assumed standard deviations that the residuals asked for."""
+    timings: dict[str, Timing]
+    """Per stage, in the order of the work, and ``total``."""
+    seconds: float
+    """Time from start to end (s)."""
+    frames_per_s: float
+    """Frames judged per second of it."""
+    options: dict[str, object]
+    """All options used."""
+    versions: dict[str, str]
+    """Of trifix and of what its numbers depend on."""
+
+
+class Tally:
+    """Gathers a ``Summary`` from Steps, a few numbers a frame."""
+
+    def __init__(self, recording: str, level: str, config_toml: str, is_online: bool) -> None:
+        self._recording, self._level, self._is_online = recording, level, is_online
+        self._options: dict[str, object] = tomllib.loads(config_toml)
+        self._frames = self._positioned = 0
+        self._reasons: Counter[str] = Counter()
+        self._mm, self._px = _Spread(), _Spread()
+        self._timings_ms: dict[str, array[float]] = {}
+        self._noise_scale = 1.0
+
+    def add(self, step: Step, residual_px: Float[np.ndarray, "d"]) -> None:
+        """Count one frame, with the distances of its identified dots from their reprojected targets (px)."""
+        self._frames += 1
+        match step.fix:
+            case Fix() as fix:
+                self._positioned += 1
+                if fix.reason is not None:
+                    self._reasons[fix.reason.name] += 1
+                self._mm.add(fix.residual_mm)
+                self._px.add(residual_px)
+            case NoFix() as refusal:
+                self._reasons[refusal.why.name] += 1
+        for stage, ms in (*step.timings_ms.items(), ("total", sum(step.timings_ms.values()))):
+            self._timings_ms.setdefault(stage, array("d")).append(ms)
+        self._noise_scale = step.noise_scale
+
+    def summary(self, targets: ReferenceMap, seconds: float, finished: bool) -> Summary:
+        """The numbers so far, with the map as it now is."""
+        total = self._timings_ms.get("total", array("d"))
+        stages = {name: ms for name, ms in self._timings_ms.items() if name != "total"} | {"total": total}
+        return Summary(
+            recording=self._recording,
+            level=self._level,
+            is_online=self._is_online,
+            finished=finished,
+            frames=self._frames,
+            positioned=self._positioned,
+            refused=self._frames - self._positioned,
+            reasons=dict(self._reasons.most_common()),
+            targets={
+                state.name: int((targets.state == state).sum())
+                for state in (TargetState.trusted, TargetState.provisional, TargetState.quarantined)
+            },
+            residual_mm=self._mm.residuals(),
+            residual_px=self._px.residuals(),
+            noise_scale=self._noise_scale,
+            timings={
+                name: Timing(float(np.median(ms)), float(np.percentile(ms, 99)), len(ms))
+                for name, ms in stages.items()
+                if ms
+            },
+            seconds=seconds,
+            frames_per_s=self._frames / seconds if seconds > 0 else 0.0,
+            options=self._options,
+            versions=versions(),
+        )
+
+
+class _Spread:
+    """Residuals of a run, gathered frame by frame: their sum of squares, and each frame's rms."""
+
+    def __init__(self) -> None:
+        self._count, self._sum = 0, 0.0
+        self._frame_rms = array("d")
+
+    def add(self, residual: Float[np.ndarray, "n"]) -> None:
+        known = residual[np.isfinite(residual)]
+        if not len(known):
+            return
+        squares = float((known**2).sum())
+        self._count += len(known)
+        self._sum += squares
+        self._frame_rms.append((squares / len(known)) ** 0.5)
+
+    def residuals(self) -> Residuals:
+        if not self._count:
+            return Residuals(None, None, None, 0)
+        return Residuals(
+            rms=(self._sum / self._count) ** 0.5,
+            median=float(np.median(self._frame_rms)),
+            worst=max(self._frame_rms),
+            count=self._count,
+        )
+
+
+def versions() -> dict[str, str]:
+    """Of trifix, of what its numbers depend on, and of Python."""
+    packages = {"trifix": "trifix", "numpy": "numpy", "opencv": "opencv-python-headless", "numba": "numba"}
+    return {name: version(package) for name, package in packages.items()} | {"python": platform.python_version()}
