@@ -1,0 +1,98 @@
+"""One page that shows a run: what came of it, where the targets and the sensor were, what its frames looked like.
+
+Made from the Steps as they pass, of which it keeps a few numbers each and a handful of small pictures. Computes no
+result of its own and asks nothing of the network: figures and pictures are part of the page.
+"""
+
+from array import array
+from datetime import datetime
+from pathlib import Path
+
+import numpy as np
+from jinja2 import Environment, PackageLoader, StrictUndefined
+
+from trifix.files.tables import write_atomically
+from trifix.outputs.figures import Course, path_figure, time_figure
+from trifix.outputs.samples import KINDS, Samples
+from trifix.outputs.summary import Summary
+from trifix.records import Fix, NoFix, PositionedReason, Reason, ReferenceMap, Step
+
+
+class Report:
+    """Watches a run and writes its page.
+
+    report = Report()
+    for step in steps:
+        report.show(step)
+    report.write(out / "report.html", summary)
+    """
+
+    def __init__(self) -> None:
+        self._samples = Samples()
+        self._frame, self._points, self._matched = array("q"), array("q"), array("q")
+        self._residual_mm, self._pose = array("d"), array("d")
+        self._outcome: list[str] = []
+        self._map = ReferenceMap.empty()
+
+    def show(self, step: Step) -> None:
+        """Look at the next frame."""
+        self._samples.show(step)
+        self._frame.append(step.frame.index)
+        self._points.append(0 if step.points is None else len(step.points))
+        self._map = step.map
+        match step.fix:
+            case Fix() as fix:
+                T = fix.T_world_sensor
+                self._outcome.append("positioned")
+                self._matched.append(len(fix.point))
+                self._residual_mm.append(fix.rms_mm)
+                self._pose.extend((*T.t_mm, *T.R[:, 2]))
+            case NoFix() as refusal:
+                self._outcome.append(refusal.why.name)
+                self._matched.append(refusal.matched)
+                self._residual_mm.append(np.nan)
+                self._pose.extend((np.nan,) * 6)
+
+    def write(self, path: Path, summary: Summary) -> None:
+        """Write the page, self-contained."""
+        course = self._course()
+        samples = self._samples.chosen()
+        drawn = {kind for each in samples for picture in each.pictures for kind, uv in picture.dots.items() if len(uv)}
+        page = _environment().get_template("report.html.jinja")
+        text = page.render(
+            summary=summary,
+            written=datetime.now().astimezone(),
+            time_figure=time_figure(course) if len(course.frame) else "",
+            path_figure=path_figure(course, self._map) if len(course.frame) else "",
+            samples=samples,
+            kinds=[kind for kind in KINDS if kind in drawn],
+            sentences={each.name: each.value for each in (*PositionedReason, *Reason)},
+            refusals=[each.name for each in Reason],
+        )
+        write_atomically(path, text)
+
+    def _course(self) -> Course:
+        pose = np.array(self._pose).reshape(-1, 6)
+        return Course(
+            frame=np.array(self._frame, dtype=np.int64),
+            outcome=self._outcome,
+            points=np.array(self._points, dtype=np.int64),
+            matched=np.array(self._matched, dtype=np.int64),
+            residual_mm=np.array(self._residual_mm),
+            position_mm=pose[:, :3],
+            forward=pose[:, 3:],
+        )
+
+
+def _environment() -> Environment:
+    environment = Environment(
+        loader=PackageLoader("trifix.outputs", "."),
+        autoescape=True,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    environment.filters["words"] = lambda name: name.replace("_", " ")
+    environment.filters["thousands"] = lambda count: f"{count:,}".replace(",", "\u202f")
+    environment.filters["number"] = lambda value, digits=3: "–" if value is None else f"{value:.{digits}g}"
+    return environment

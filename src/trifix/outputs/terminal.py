@@ -1,0 +1,34 @@
+"""What the terminal says after a run. Knows a Summary, and neither Steps nor files."""
+
+from pathlib import Path
+
+from rich.console import Group
+from rich.table import Table
+from rich.text import Text
+
+from trifix.outputs.summary import Summary
+from trifix.records import Reason
+
+
+def summary_table(summary: Summary, report: Path) -> Group:
+    """A run at a glance, for ``rich`` to print."""
+    table = Table.grid(padding=(0, 2))
+    table.add_column(style="dim")
+    table.add_column(justify="right")
+    table.add_column()
+    share = f"{100 * summary.positioned / summary.frames:.1f} %" if summary.frames else ""
+    table.add_row("positioned", Text(str(summary.positioned), "bold green"), f"of {summary.frames} frames  {share}")
+    for name, count in summary.reasons.items():
+        is_refusal = name in Reason.__members__
+        words = Reason[name].value if is_refusal else "positioned"
+        table.add_row(name.replace("_", " "), Text(str(count), "yellow" if is_refusal else ""), Text(words, "dim"))
+    provisional = summary.targets["provisional"]
+    table.add_row("targets", str(summary.targets["trusted"]), f"and {provisional} provisional" if provisional else "")
+    for unit, residuals in (("mm", summary.residual_mm), ("px", summary.residual_px)):
+        if residuals.rms is not None:
+            table.add_row("residual, rms", f"{residuals.rms:.3f}", f"{unit}  worst frame {residuals.worst:.3f}")
+    table.add_row("noise", f"{summary.noise_scale:.2f}", "times what was stated or assumed")
+    if total := summary.timings.get("total"):
+        table.add_row("time a frame", f"{total.median_ms:.1f}", f"ms  99 % below {total.p99_ms:.1f}")
+    table.add_row("in all", f"{summary.seconds:.1f}", f"s  {summary.frames_per_s:.1f} frames/s")
+    return Group(table, Text(), Text.assemble("report  ", (str(report), "bold")))
