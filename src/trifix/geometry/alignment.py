@@ -65,3 +65,11 @@ def align_weighted(
         if np.abs(delta).max() < 1e-10:
             break
     return T, cov
+
+
+def spread_off_line_mm(xyz_mm: Float[np.ndarray, "n 3"]) -> float:
+    """Root mean square distance of the points from the straight line that fits them best."""
+    if len(xyz_mm) < 3:
+        return 0.0
+    s = np.linalg.svd(xyz_mm - xyz_mm.mean(axis=0), compute_uv=False)
+    return float(np.sqrt((s[1:] ** 2).sum() / len(xyz_mm)))

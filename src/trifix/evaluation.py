@@ -1,0 +1,707 @@
+"""Steps against truth: rates, errors, consistency of the covariances. Computed once, for report, tests and benchmarks.
+
+Every rate is counted on truth alone, never on what the program trusts. ``compare_poses``, ``normalised_errors`` and
+``compare_targets`` work on arrays; ``evaluate`` feeds them from a results folder and a truth folder. How the results
+came about is not its business, nor how the figures are shown.
+"""
+
+import json
+import math
+from collections import Counter, defaultdict
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from trifix.errors import RecordingError
+from trifix.files.images import holds_images
+from trifix.files.maps import read_map
+from trifix.files.recordings import LEVELS, Level, Recording, read_recording
+from trifix.files.tables import read_table
+from trifix.files.trajectories import read_poses
+from trifix.files.truth import Truth, read_truth
+from trifix.geometry.alignment import align, align_weighted, spread_off_line_mm
+from trifix.geometry.camera import StereoRig
+from trifix.geometry.pose import Pose
+from trifix.records import (
+    Dots,
+    PositionedReason,
+    ReferenceMap,
+    SensorPoints,
+    StereoDots,
+    StereoMatches,
+    TargetState,
+)
+from trifix.stages.triangulate import triangulate
+
+SIGMAS = 5.0
+"""A wrong pose that is nearer than this to the pose of the true labels is drift, not misidentification."""
+LINE_RMS_MM = 3.0
+"""Targets lie on one line if they are nearer to it than this (mm rms)."""
+NEAR_PX = 2.0
+"""A detected dot is the nearest imaged target within this distance (px)."""
+
+
+@dataclass(frozen=True, slots=True)
+class Share:
+    """So many of so many."""
+
+    count: int
+    """How many."""
+    of: int
+    """Of how many."""
+
+    def __str__(self) -> str:
+        return f"{self.count} of {self.of}" + (f" ({100 * self.count / self.of:.1f} %)" if self.of else "")
+
+
+@dataclass(frozen=True, slots=True)
+class Spread:
+    """Absolute errors in three numbers; NaN where there are none."""
+
+    median: float
+    """Half are smaller."""
+    rmse: float
+    """Root mean square."""
+    max: float
+    """The largest."""
+
+    @staticmethod
+    def of(errors: Float[np.ndarray, "n"]) -> "Spread":
+        """Of n absolute errors."""
+        if not len(errors):
+            return Spread(math.nan, math.nan, math.nan)
+        return Spread(float(np.median(errors)), float(np.sqrt(np.mean(errors**2))), float(errors.max()))
+
+
+@dataclass(frozen=True, slots=True)
+class Consistency:
+    """Whether covariances tell the truth: normalised squared errors (NEES), 6 degrees of freedom a pose.
+
+    The limits hold for independent errors. Poses share the errors of the map, so honest covariances may leave them,
+    all the more the fewer targets there are.
+    """
+
+    poses: int
+    """Poses with a covariance; those that define the world and misidentified ones are left out."""
+    mean: float
+    """Mean squared error in units of the covariance, over the degrees of freedom: 1 is honest, more overconfident."""
+    low: float
+    """The mean lies above this with 97.5 % probability."""
+    high: float
+    """The mean lies below this with 97.5 % probability."""
+    inside: Share
+    """Poses whose own squared error lies between its 2.5 % and 97.5 % limits; expected 95 %."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PoseErrors:
+    """n poses against their truth."""
+
+    T_truth_world: Pose
+    """The one rigid motion from the poses' world to the truth's; the identity if the map was given."""
+    error_mm: Float[np.ndarray, "n"]
+    """Distance from the true position (mm)."""
+    error_deg: Float[np.ndarray, "n"]
+    """Angle to the true rotation (degrees)."""
+    is_wrong: Bool[np.ndarray, "n"]
+    """Off by more than one of the limits."""
+    ape_rmse_mm: float
+    """Absolute pose error as the field reports it (evo): rms distance after aligning the positions alone (mm)."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class TargetErrors:
+    """Targets of a map against their truth."""
+
+    error_mm: Float[np.ndarray, "n"]
+    """Distance from the true position (mm), after alignment unless the map was given."""
+    found: Share
+    """True targets that stand in the map."""
+    duplicates: int
+    """Targets that are the same true target as another."""
+    unknown: int
+    """Targets that are no true target: clutter, or reflections."""
+
+
+@dataclass(frozen=True, slots=True)
+class Evaluation:
+    """A run against truth. ``table`` puts it in words, ``to_dict`` makes it ready for JSON."""
+
+    frames: int
+    """Frames of the recording."""
+    positioned: int
+    """Frames with a pose."""
+    refused: dict[str, int]
+    """Frames without, per reason."""
+    is_map_given: bool
+    """Poses were compared in the coordinates of the given map, without alignment."""
+    of_positionable: Share
+    """Positioned frames, of those with three targets seen by both cameras here and in two earlier frames."""
+    of_reachable_online: Share
+    """Positioned frames, of those that a map growing frame by frame can reach."""
+    of_reachable_offline: Share
+    """Positioned frames, of those linked in any order."""
+    of_sharing: Share
+    """Positioned frames, of those that share three targets not on one line with the program's own map as of then."""
+    wrong: int
+    """Poses off truth by more than the limits."""
+    wrong_mm: float
+    """Limit on the position (mm)."""
+    wrong_deg: float
+    """Limit on the rotation (degrees)."""
+    misidentified: tuple[int, ...]
+    """Frames whose pose is off by more than the limits, and by more than five sigma, from the pose that the frame's
+    true labels give against the same map. This must never happen."""
+    drifted: int
+    """Wrong poses that are not misidentified."""
+    unlabelled: int
+    """Poses of frames with too few true labels for a pose: these are misidentified when wrong against truth."""
+    error_mm: Spread
+    """Position against truth, all positioned frames (mm)."""
+    error_deg: Spread
+    """Rotation against truth, all positioned frames (degrees)."""
+    drift_mm: Spread
+    """Position against truth, misidentified frames left out (mm)."""
+    drift_deg: Spread
+    """Rotation against truth, misidentified frames left out (degrees)."""
+    ape_rmse_mm: float
+    """Absolute pose error as evo reports it (mm)."""
+    sightings: Share
+    """Sightings identified rightly, of those that concern a true target."""
+    consistency: Consistency
+    """Whether the poses' covariances tell the truth, in the gauge of the output."""
+    targets: Share
+    """True targets that stand in the map, of all."""
+    duplicates: int
+    """Targets that are the same true target as another."""
+    unknown_targets: int
+    """Targets of the map that are no true target."""
+    target_mm: Spread
+    """Targets against truth (mm)."""
+
+    def to_dict(self) -> dict[str, object]:
+        """The same as plain values for JSON, which has no NaN: those become null."""
+        plain: dict[str, object] = json.loads(json.dumps(asdict(self)), parse_constant=lambda _: None)
+        return plain
+
+
+def table(evaluation: Evaluation) -> list[tuple[str, str]]:
+    """Rows of (what, figure with unit) for people."""
+    e = evaluation
+    limits = f"{e.wrong_mm:g} mm or {e.wrong_deg:g}°"
+    return [
+        ("frames", str(e.frames)),
+        ("positioned", str(Share(e.positioned, e.frames))),
+        *((f"refused: {reason}", str(count)) for reason, count in e.refused.items()),
+        ("positioned of positionable", str(e.of_positionable)),
+        ("positioned of reachable online", str(e.of_reachable_online)),
+        ("positioned of reachable offline", str(e.of_reachable_offline)),
+        ("positioned of those sharing three targets with the map", str(e.of_sharing)),
+        (f"wrong poses (beyond {limits})", str(e.wrong)),
+        ("misidentified", str(len(e.misidentified))),
+        ("drifted", str(e.drifted)),
+        ("poses without labels enough to judge them", str(e.unlabelled)),
+        ("position error, median · rms · worst", _figures(e.error_mm, "mm")),
+        ("rotation error, median · rms · worst", _figures(e.error_deg, "°")),
+        ("drift in position, median · rms · worst", _figures(e.drift_mm, "mm")),
+        ("drift in rotation, median · rms · worst", _figures(e.drift_deg, "°")),
+        ("absolute pose error, rms", f"{e.ape_rmse_mm:.3f} mm"),
+        ("sightings identified rightly", str(e.sightings)),
+        (
+            "squared pose error over its covariance, mean",
+            f"{e.consistency.mean:.2f} ({e.consistency.low:.2f} to {e.consistency.high:.2f} expected)",
+        ),
+        ("poses within their own 95 % limits", str(e.consistency.inside)),
+        ("true targets in the map", str(e.targets)),
+        ("targets twice in the map", str(e.duplicates)),
+        ("targets of the map that are none", str(e.unknown_targets)),
+        ("target error, median · rms · worst", _figures(e.target_mm, "mm")),
+    ]
+
+
+def compare_poses(
+    estimated: Sequence[Pose],
+    truth: Sequence[Pose],
+    *,
+    is_map_given: bool = False,
+    wrong_mm: float = 3.0,
+    wrong_deg: float = 0.5,
+) -> PoseErrors:
+    """Poses of the sensor against the true ones, as they are if the map was given, else after one rigid alignment.
+
+    The alignment uses positions and rotations, with the lever arm at which the two limits weigh the same, so that a
+    short or straight path does not leave it open; and it goes with the majority, so that wrong poses do not hide.
+    """
+    T_truth_world, ape_rmse_mm = Pose.identity(), math.nan
+    if estimated:
+        positions = np.array([T.t_mm for T in estimated])
+        true_positions = np.array([T.t_mm for T in truth])
+        if not is_map_given:
+            lever_mm = wrong_mm / math.radians(wrong_deg)
+            corners = np.vstack([np.zeros((1, 3)), np.eye(3)]) * lever_mm
+            T_truth_world, _ = _align_majority(
+                np.array([T.apply(corners) for T in estimated]), np.array([T.apply(corners) for T in truth])
+            )
+            positions = align(positions, true_positions).apply(positions)
+        ape_rmse_mm = float(np.sqrt(((positions - true_positions) ** 2).sum(axis=1).mean()))
+    offsets = [T_true.inverse() @ T_truth_world @ T for T, T_true in zip(estimated, truth, strict=True)]
+    error_mm = np.array([np.linalg.norm(T.t_mm) for T in offsets])
+    error_deg = np.degrees([T.angle_rad() for T in offsets])
+    return PoseErrors(T_truth_world, error_mm, error_deg, (error_mm > wrong_mm) | (error_deg > wrong_deg), ape_rmse_mm)
+
+
+def normalised_errors(
+    estimated: Sequence[Pose], truth: Sequence[Pose], cov: Float[np.ndarray, "n 6 6"], *, is_map_given: bool = False
+) -> Float[np.ndarray, "n"]:
+    """Squared errors in units of their covariance, δᵀ C⁻¹ δ with T_true = T_est · exp(δ), as the output means them.
+
+    Unless the map was given, the world is the sensor of the first pose: truth is brought into that gauge, not aligned.
+    NaN where the covariance is singular, as that of the pose which defines the world.
+    """
+    T_world_truth = Pose.identity() if is_map_given or not estimated else estimated[0] @ truth[0].inverse()
+    nees = np.full(len(estimated), np.nan)
+    for k, (T, T_true, C) in enumerate(zip(estimated, truth, cov, strict=True)):
+        if np.linalg.eigvalsh(C)[0] > 0:
+            delta = (T.inverse() @ T_world_truth @ T_true).log()
+            nees[k] = delta @ np.linalg.solve(C, delta)
+    return nees
+
+
+def consistency(nees: Float[np.ndarray, "n"]) -> Consistency:
+    """Squared normalised errors of n poses, NaN left out, against the chi-square law of 6 degrees of freedom."""
+    from scipy.special import chdtri
+
+    known = nees[np.isfinite(nees)]
+    n = len(known)
+    if not n:
+        return Consistency(0, math.nan, math.nan, math.nan, Share(0, 0))
+    low, high = (float(chdtri(6 * n, p)) / (6 * n) for p in (0.975, 0.025))
+    inside = int(((known > chdtri(6, 0.975)) & (known < chdtri(6, 0.025))).sum())
+    return Consistency(n, float(known.mean()) / 6, low, high, Share(inside, n))
+
+
+def compare_targets(
+    xyz_mm: Float[np.ndarray, "k 3"],
+    identity: Int[np.ndarray, "k"],
+    true_xyz_mm: Mapping[int, Float[np.ndarray, "3"]],
+    *,
+    is_map_given: bool = False,
+) -> TargetErrors:
+    """Targets of a map against the true targets that they are (-1: none), after one alignment of their own."""
+    known = identity >= 0
+    b, a = xyz_mm[known], np.array([true_xyz_mm[int(i)] for i in identity[known]]).reshape(-1, 3)
+    if len(b) >= 3 and not is_map_given:
+        T, _ = _align_majority(b[:, None], a[:, None])
+        b = T.apply(b)
+    found = len(set(identity[known].tolist()))
+    return TargetErrors(
+        error_mm=np.asarray(np.linalg.norm(b - a, axis=1)),
+        found=Share(found, len(true_xyz_mm)),
+        duplicates=int(known.sum()) - found,
+        unknown=int((~known).sum()),
+    )
+
+
+def _align_majority(b: Float[np.ndarray, "n k 3"], a: Float[np.ndarray, "n k 3"]) -> tuple[Pose, Bool[np.ndarray, "n"]]:
+    """``T_a_b`` of the items (k points each) that agree with the median, and which these are.
+
+    Least trimmed squares (Rousseeuw 1984): align the nearer half until it stays the same, then all within three
+    medians. Up to a good third of the items may be off, even if they agree among themselves.
+    """
+    n, k = b.shape[:2]
+    half = min(n, max(n // 2 + 1, math.ceil(3 / k)))
+    kept = np.ones(n, dtype=bool)
+    for _ in range(30):
+        T = align(b[kept].reshape(-1, 3), a[kept].reshape(-1, 3))
+        distance = _rms_distance(T, b, a)
+        nearer = np.zeros(n, dtype=bool)
+        nearer[np.argsort(distance, kind="stable")[:half]] = True
+        if (nearer == kept).all():
+            break
+        kept = nearer
+    kept = distance <= max(3 * float(np.median(distance)), 1e-6)
+    return align(b[kept].reshape(-1, 3), a[kept].reshape(-1, 3)), kept
+
+
+def _rms_distance(T: Pose, b: Float[np.ndarray, "n k 3"], a: Float[np.ndarray, "n k 3"]) -> Float[np.ndarray, "n"]:
+    moved = T.apply(b.reshape(-1, 3)).reshape(b.shape)
+    return np.asarray(np.sqrt(((moved - a) ** 2).sum(axis=2).mean(axis=1)))
+
+
+def _figures(spread: Spread, unit: str) -> str:
+    return f"{spread.median:.3f} · {spread.rmse:.3f} · {spread.max:.3f} {unit}"
+
+
+# --- from the folders ------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Labelled:
+    """Points of one frame of which it is known which true targets they are, each target once."""
+
+    id: Int[np.ndarray, "p"]
+    xyz_mm: Float[np.ndarray, "p 3"]
+    cov_mm2: Float[np.ndarray, "p 3 3"]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Sightings:
+    """What was said to be which target, and which true target it is; -1: none."""
+
+    frame: Int[np.ndarray, "s"]
+    target: Int[np.ndarray, "s"]
+    label: Int[np.ndarray, "s"]
+
+
+def evaluate(
+    out: Path,
+    truth: Path,
+    *,
+    wrong_mm: float = 3.0,
+    wrong_deg: float = 0.5,
+    is_map_given: bool | None = None,
+    recording: Path | None = None,
+) -> Evaluation:
+    """The results folder ``out`` against the truth folder ``truth``.
+
+    The limits say from where a pose is wrong; some recordings state their own. Without ``is_map_given`` the map counts
+    as given if no frame defines the world. ``recording`` holds the points or dots from which the poses of the true
+    labels are worked out; without it, it is sought beside the truth.
+
+    Raises:
+        RecordingError: a file is missing or broken, or results and truth are not of one recording.
+    """
+    results = read_table(out / "frames.csv", {"frame": int, "status": str}, {"reason": str})
+    is_positioned = results["status"] == "positioned"
+    reasons = results.get("reason", np.full(len(is_positioned), "", dtype=object))
+    if is_map_given is None:
+        is_map_given = PositionedReason.defines_world.name not in reasons
+    frame, _, estimated, cov = read_poses(out / "poses.csv")
+    targets = read_map(out / "map.csv")
+    level = _level_of(out)
+    known = read_truth(truth)
+    source = _recording_beside(truth, level) if recording is None else read_recording(recording, level)
+
+    true_poses = _true_poses(known, frame)
+    errors = compare_poses(estimated, true_poses, is_map_given=is_map_given, wrong_mm=wrong_mm, wrong_deg=wrong_deg)
+    labelled, labels = _labels(out, level, source, known)
+    sightings = _read_sightings(out / "sightings.csv", labels)
+    true_xyz_mm = dict(zip(known.targets.id.tolist(), known.targets.xyz_mm, strict=True))
+    identity = _identities(targets, sightings, true_xyz_mm, wrong_mm if is_map_given else None)
+    is_misidentified, is_judged = _misidentified(
+        frame, estimated, errors, targets, identity, labelled, wrong_mm, wrong_deg
+    )
+    is_right = ~is_misidentified
+
+    is_trusted = targets.state == TargetState.trusted
+    target_errors = compare_targets(
+        targets.xyz_mm[is_trusted],
+        np.array([identity.get(i, -1) for i in targets.id[is_trusted].tolist()], dtype=np.int64),
+        true_xyz_mm,
+        is_map_given=is_map_given,
+    )
+    judged, positioned = set(results["frame"].tolist()), set(results["frame"][is_positioned].tolist())
+
+    def share_of(frames: Iterable[int]) -> Share:
+        which = judged & set(frames)
+        return Share(len(which & positioned), len(which))
+
+    index = known.frames.index
+    return Evaluation(
+        frames=len(judged),
+        positioned=len(positioned),
+        refused=dict(Counter(reasons[~is_positioned].tolist()).most_common()),
+        is_map_given=is_map_given,
+        of_positionable=share_of(index[known.frames.positionable].tolist()),
+        of_reachable_online=share_of(index[known.frames.reachable_online].tolist()),
+        of_reachable_offline=share_of(index[known.frames.reachable_offline].tolist()),
+        of_sharing=share_of(
+            _sharing(labelled, sightings, set(identity.values()) if is_map_given else set(), true_xyz_mm)
+        ),
+        wrong=int(errors.is_wrong.sum()),
+        wrong_mm=wrong_mm,
+        wrong_deg=wrong_deg,
+        misidentified=tuple(frame[is_misidentified].tolist()),
+        drifted=int((errors.is_wrong & is_right).sum()),
+        unlabelled=int((~is_judged).sum()),
+        error_mm=Spread.of(errors.error_mm),
+        error_deg=Spread.of(errors.error_deg),
+        drift_mm=Spread.of(errors.error_mm[is_right]),
+        drift_deg=Spread.of(errors.error_deg[is_right]),
+        ape_rmse_mm=errors.ape_rmse_mm,
+        sightings=_identified_rightly(sightings, identity),
+        consistency=consistency(normalised_errors(estimated, true_poses, cov, is_map_given=is_map_given)[is_right]),
+        targets=target_errors.found,
+        duplicates=target_errors.duplicates,
+        unknown_targets=target_errors.unknown,
+        target_mm=Spread.of(target_errors.error_mm),
+    )
+
+
+def _level_of(out: Path) -> Level:
+    """The level at which the run began."""
+    file = out / "summary.json"
+    try:
+        level = json.loads(file.read_text(encoding="utf-8")).get("level")
+    except (OSError, ValueError) as fault:
+        raise RecordingError(f"{file} cannot be read ({fault}); is {out} a results folder?") from fault
+    for known in LEVELS:
+        if level == known:
+            return known
+    raise RecordingError(f"{file}: found level {level!r}, expected one of {', '.join(LEVELS)}.")
+
+
+def _recording_beside(truth: Path, level: Level) -> Recording | None:
+    """The recording of some level in the folder that holds the truth; None if there is none."""
+    for name in (f"recording_{level}", "recording"):
+        folder = truth.resolve().parent / name
+        if holds_images(folder) if level == "images" else (folder / f"{level}.csv").exists():
+            return read_recording(folder, level)
+    return None
+
+
+def _true_poses(truth: Truth, frames: Int[np.ndarray, "n"]) -> list[Pose]:
+    row_of = {frame: row for row, frame in enumerate(truth.frames.index.tolist())}
+    for frame in frames.tolist():
+        if frame not in row_of:
+            raise RecordingError(
+                f"{truth.path} knows no frame {frame} of the results; do they belong to the same recording?"
+            )
+    return [truth.frames.T_map_sensor[row_of[frame]] for frame in frames.tolist()]
+
+
+def _labels(
+    out: Path, level: Level, source: Recording | None, truth: Truth
+) -> tuple[dict[int, _Labelled], dict[str, Int[np.ndarray, "r"]]]:
+    """The labelled points of each frame, and per kind of sighting the label of each row of its table."""
+    if level == "points":
+        ids = truth.id_of_point
+        if ids is None:
+            return {}, {}
+        seen = ((frame.index, frame.content) for frame in source or ())
+        points = {k: _once_each(p, _labels_of(p.row, ids)) for k, p in seen if isinstance(p, SensorPoints)}
+        return points, {"point": ids}
+    if level == "dots":
+        ids = truth.id_of_dot
+        frames = [
+            (frame.index, frame.rig, frame.content) for frame in source or () if isinstance(frame.content, StereoDots)
+        ]
+    else:
+        frames = [] if source is None else _detected(out / "dots.csv", source)
+        ids = None if source is None else _labels_by_projection(frames, truth)
+    if ids is None:
+        return {}, {}
+    points = {
+        k: _triangulated(dots, rig, _labels_of(dots.left.row, ids), _labels_of(dots.right.row, ids))
+        for k, rig, dots in frames
+        if rig is not None
+    }
+    return points, {"left": ids, "right": ids}
+
+
+def _labels_of(rows: Int[np.ndarray, "n"], ids: Int[np.ndarray, "r"]) -> Int[np.ndarray, "n"]:
+    """The labels of some rows of a table."""
+    strange = rows[(rows < 0) | (rows >= len(ids))]
+    if len(strange):
+        raise RecordingError(
+            f"row {strange[0]} has no label in the truth, which knows {len(ids)} rows; do recording, results and truth "
+            "belong together?"
+        )
+    return np.asarray(ids[rows])
+
+
+def _once_each(points: SensorPoints, label: Int[np.ndarray, "n"]) -> _Labelled:
+    """The points that are targets; of two with the same label, the first."""
+    ids, first = np.unique(label, return_index=True)
+    ids, first = ids[ids >= 0], first[ids >= 0]
+    return _Labelled(ids, points.xyz_mm[first], points.cov_mm2[first])
+
+
+def _triangulated(
+    dots: StereoDots, rig: StereoRig, label_left: Int[np.ndarray, "l"], label_right: Int[np.ndarray, "r"]
+) -> _Labelled:
+    """The targets that both cameras saw."""
+    ids, left, right = np.intersect1d(label_left, label_right, return_indices=True)
+    left, right = left[ids >= 0], right[ids >= 0]
+    unused = np.zeros(len(left))
+    points = triangulate(dots, StereoMatches(left, right, unused, unused), rig)
+    return _once_each(points, label_left[left[points.match]])
+
+
+def _detected(file: Path, source: Recording) -> list[tuple[int, StereoRig | None, StereoDots]]:
+    """The dots that the run itself found in the images, with the rig of each frame."""
+    table = read_table(file, {"frame": int, "camera": int, "u": float, "v": float, "sigma_px": float})
+    dots = Dots.of(np.stack([table["u"], table["v"]], axis=1))
+    dots = replace(dots, cov_px2=table["sigma_px"][:, None, None] ** 2 * np.eye(2))
+
+    image = 2 * np.searchsorted(source.index, table["frame"]) + table["camera"]
+    order = np.argsort(image, kind="stable")
+    start = np.searchsorted(image[order], np.arange(2 * len(source) + 1))
+
+    def of(i: int) -> Dots:
+        at = order[start[i] : start[i + 1]]
+        return Dots(dots.uv_px[at], dots.cov_px2[at], dots.ellipse[at], dots.label[at], at)
+
+    return [
+        (int(index), source.rigs.get(k, source.rig), StereoDots(of(2 * k), of(2 * k + 1)))
+        for k, index in enumerate(source.index)
+    ]
+
+
+def _labels_by_projection(
+    frames: Sequence[tuple[int, StereoRig | None, StereoDots]], truth: Truth
+) -> Int[np.ndarray, "r"]:
+    """Labels of detected dots: each target that faces the camera claims the dot nearest to its image.
+
+    Unlike a table of labels this does not know what hides a target, but a hidden target rarely has a dot so near.
+    """
+    ids = np.full(sum(len(dots.left) + len(dots.right) for _, _, dots in frames), -1)
+    targets = truth.targets
+    T_of = dict(zip(truth.frames.index.tolist(), truth.frames.T_map_sensor, strict=True))
+    for index, rig, dots in frames:
+        if rig is None or index not in T_of:
+            continue
+        is_there = (targets.valid_from <= index) & (index < targets.valid_to)
+        T_sensor_map = T_of[index].inverse()
+        for camera, T_camera_map, seen in (
+            (rig.left, T_sensor_map, dots.left),
+            (rig.right, rig.T_right_left @ T_sensor_map, dots.right),
+        ):
+            towards = T_camera_map.inverse().t_mm - targets.xyz_mm
+            in_camera = T_camera_map.apply(targets.xyz_mm)
+            shown = is_there & ~((towards * targets.normal).sum(axis=1) < 0) & camera.sees(in_camera)
+            if not len(seen) or not shown.any():
+                continue
+            uv = camera.project(in_camera[shown])
+            distance = np.linalg.norm(uv[:, None] - seen.uv_px[None], axis=2)
+            dot = distance.argmin(axis=1)
+            near = distance.min(axis=1) < NEAR_PX
+            ids[seen.row[dot[near]]] = targets.id[shown][near]
+    return ids
+
+
+def _read_sightings(file: Path, labels: Mapping[str, Int[np.ndarray, "r"]]) -> _Sightings:
+    """The sightings whose kind has labels."""
+    table = read_table(file, {"frame": int, "kind": str, "row": int, "target": int})
+    label = np.full(len(table["row"]), -1)
+    has_label = np.zeros(len(label), dtype=bool)
+    for kind, ids in labels.items():
+        of_kind = table["kind"] == kind
+        label[of_kind] = _labels_of(table["row"][of_kind], ids)
+        has_label |= of_kind
+    return _Sightings(table["frame"][has_label], table["target"][has_label], label[has_label])
+
+
+def _identities(
+    targets: ReferenceMap,
+    sightings: _Sightings,
+    true_xyz_mm: Mapping[int, Float[np.ndarray, "3"]],
+    near_mm: float | None,
+) -> dict[int, int]:
+    """Which true target each target of the program is, -1: none.
+
+    By place, for targets within ``near_mm`` of a true one where both have the same coordinates; else by the vote of
+    the labels of its sightings. (A vote alone would not see that a given map was taken for a shifted copy of itself.)
+    """
+    votes: defaultdict[int, Counter[int]] = defaultdict(Counter)
+    for target, label in zip(sightings.target.tolist(), sightings.label.tolist(), strict=True):
+        votes[target][label] += 1
+    identity = {target: count.most_common(1)[0][0] for target, count in votes.items()}
+    if near_mm is not None and true_xyz_mm:
+        ids, xyz_mm = np.array(list(true_xyz_mm)), np.array(list(true_xyz_mm.values()))
+        for target, xyz in zip(targets.id.tolist(), targets.xyz_mm, strict=True):
+            distance = np.linalg.norm(xyz_mm - xyz, axis=1)
+            if distance.min() < near_mm:
+                identity[target] = int(ids[distance.argmin()])
+    return identity
+
+
+def _identified_rightly(sightings: _Sightings, identity: Mapping[int, int]) -> Share:
+    """Sightings of a true target as what it is; clutter that is always the same target is neither right nor wrong."""
+    said = np.array([identity[target] for target in sightings.target.tolist()], dtype=np.int64)
+    counts = (said >= 0) | (sightings.label >= 0)
+    return Share(int((said == sightings.label)[counts].sum()), int(counts.sum()))
+
+
+def _sharing(
+    labelled: Mapping[int, _Labelled],
+    sightings: _Sightings,
+    given: set[int],
+    true_xyz_mm: Mapping[int, Float[np.ndarray, "3"]],
+) -> Iterator[int]:
+    """Frames that show three targets not on one line which were given, or entered the program's map before."""
+    entered: dict[int, int] = dict.fromkeys(given, -1)
+    for frame, label in sorted(zip(sightings.frame.tolist(), sightings.label.tolist(), strict=True)):
+        entered.setdefault(label, frame)
+    for frame, points in labelled.items():
+        xyz = [true_xyz_mm[i] for i in points.id.tolist() if entered.get(i, frame) < frame]
+        if len(xyz) >= 3 and spread_off_line_mm(np.array(xyz)) >= LINE_RMS_MM:
+            yield frame
+
+
+def _misidentified(
+    frames: Int[np.ndarray, "n"],
+    estimated: Sequence[Pose],
+    errors: PoseErrors,
+    targets: ReferenceMap,
+    identity: Mapping[int, int],
+    labelled: Mapping[int, _Labelled],
+    wrong_mm: float,
+    wrong_deg: float,
+) -> tuple[Bool[np.ndarray, "n"], Bool[np.ndarray, "n"]]:
+    """Which poses are misidentified, and which of them the labels of their frame could judge."""
+    row_of: dict[int, int] = {}  # of the same true target twice, the one seen more often
+    for row in np.argsort(targets.sightings, kind="stable"):
+        row_of[identity.get(int(targets.id[row]), -1)] = int(row)
+    row_of.pop(-1, None)
+    by_label: list[tuple[Pose, Float[np.ndarray, "6 6"], float] | None] = []
+    for frame in frames.tolist():
+        points = labelled.get(frame)
+        pairs = [] if points is None else [(k, row_of[i]) for k, i in enumerate(points.id.tolist()) if i in row_of]
+        by_label.append(
+            None if points is None else _pose_of_labels(points, targets, np.array(pairs).reshape(-1, 2), wrong_mm)
+        )
+    # the noise of the points may be stated wrongly: what the true labels leave over says by how much
+    looseness = [fit[2] for fit in by_label if fit is not None and np.isfinite(fit[2])]
+    variance = float(np.median(looseness)) if looseness else 1.0
+
+    is_misidentified = errors.is_wrong.copy()
+    is_judged = np.zeros(len(frames), dtype=bool)
+    for k, (T, fit) in enumerate(zip(estimated, by_label, strict=True)):
+        if fit is None:
+            continue
+        offset = fit[0].inverse() @ T
+        delta = offset.log()
+        is_off = np.linalg.norm(offset.t_mm) > wrong_mm or math.degrees(offset.angle_rad()) > wrong_deg
+        is_misidentified[k] = is_off and delta @ np.linalg.solve(fit[1], delta) > SIGMAS**2 * variance
+        is_judged[k] = True
+    return is_misidentified, is_judged
+
+
+def _pose_of_labels(
+    points: _Labelled, targets: ReferenceMap, pairs: Int[np.ndarray, "c 2"], wrong_mm: float
+) -> tuple[Pose, Float[np.ndarray, "6 6"], float] | None:
+    """The pose that the true labels give against the program's map, its covariance, and chi-square per freedom.
+
+    Targets that the map by itself has in a wrong place (more than ``wrong_mm``, and five medians, from where the
+    others put them) take no part. None with fewer than three targets, or with all on one line.
+    """
+    while True:
+        if len(pairs) < 3:
+            return None
+        b, a = points.xyz_mm[pairs[:, 0]], targets.xyz_mm[pairs[:, 1]]
+        T = align(b, a)
+        distance = np.linalg.norm(T.apply(b) - a, axis=1)
+        if distance.max() <= max(wrong_mm, 5 * float(np.median(distance))):
+            break
+        pairs = np.delete(pairs, int(distance.argmax()), axis=0)
+    if spread_off_line_mm(a) < LINE_RMS_MM:
+        return None
+    C_b, C_a = points.cov_mm2[pairs[:, 0]], targets.cov_mm2[pairs[:, 1]]
+    T, cov = align_weighted(b, a, C_b, C_a)
+    r = T.apply(b) - a
+    chi2 = float(np.einsum("ni,ni->", r, np.linalg.solve(T.R @ C_b @ T.R.T + C_a, r[:, :, None])[:, :, 0]))
+    return T, cov, chi2 / (3 * len(b) - 6)
