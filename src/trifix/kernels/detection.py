@@ -25,6 +25,8 @@ _LOG_BLUR = 0.8  # spread of the edge's blur about _BLUR_PX
 _BLUR_PX = 0.8
 _MIN_BLUR_PX = 0.29  # the pixel's own aperture: 1/sqrt(12)
 _QUANTISATION_VARIANCE = 1.0 / 12.0
+_ALIASING_PX2 = 0.013**2
+_SOLID_RADIUS_PX = 8  # of larger dots only a band along the edge is looked at
 _ENOUGH = 400  # pixels for the first, rough fit
 
 
@@ -414,48 +416,50 @@ def fit_ellipses(
         x[3] = -uv / (radius * radius) / x[2]
         x[4] = sqrt(uu / (radius * radius) - x[3] * x[3])
         x[5] = _BLUR_PX / radius
-        is_rough = coarseness_px[k] > 0
-        variance, margin, needed = np.nan, 0.0, 3.0 + coarseness_px[k]
-        # Again where the edge proves to lie or to reach elsewhere than the window was laid for.
+        variance, needed = np.nan, 3.0 + coarseness_px[k]
+        # A rough pass tells the noise, against which the prior is weighed, and where the edge lies; a second is final
+        # unless the edge reaches beyond its window.
         for attempt in range(3):
             margin = needed
             room = int((2 * (sqrt(max(uu, vv)) + margin) + 6) ** 2)
             if room > len(pixels):
                 pixels = np.empty((room, 3))
-            inner = (margin + 2) / radius if radius > 8 else np.inf
+            inner = (margin + 2) / radius if radius > _SOLID_RADIUS_PX else np.inf
             n = _gather(image, u0, v0, radius, x, margin / radius, inner, pixels)
-            if is_rough:
-                n = _thin(pixels, n)
             if attempt == 0:
+                n = _thin(pixels, n)
                 if n < 2 * _N or not _set_levels(pixels, n, x):
                     break
                 if sign * x[9] < 0.5 * min_contrast * max(x[6], x[6] + x[9]):
                     break
                 variance = max(1.0, 0.01 * x[9] * x[9])
-            enough_px = 0.1 if is_rough else 5e-4
+            enough_px = 0.1 if attempt == 0 else 5e-4
             variance = _descend(pixels, n, x, radius, variance, sign, max_residual, enough_px, H)
             if not variance >= 0:
                 break
             variance = max(variance, _QUANTISATION_VARIANCE)
             needed = 3.0 + 3.0 * max(0.0, x[5] * radius - 0.8)
-            if not is_rough and needed < margin + 1:
+            if attempt > 0 and needed < margin + 1:
                 break
-            is_rough = False
         if not variance >= 0 or not _factor(H, 0.0, L):
             continue
         c_uu, c_uv, c_vv = _leading_inverse(L)
         unit = variance * radius * radius
+        # What sampling a sharp edge adds (px², each way): found to fall with the number of pixels along the edge, and
+        # as the spectrum of the blur at the sampling frequency, exp(−2π²s²).
+        blur_px = x[5] * radius
+        aliasing = _ALIASING_PX2 / radius * exp(-4 * pi**2 * (blur_px**2 - _MIN_BLUR_PX**2))
         p, r, t = x[2], x[3], x[4]
         # Form of the ellipse E = (AᵀA)⁻¹ and its eigenvalues a², b².
         e_uu, e_uv, e_vv = (1 + (r / t) ** 2) / (p * p), -r / (p * t * t), 1 / (t * t)
         spread = sqrt(0.25 * (e_uu - e_vv) ** 2 + e_uv * e_uv)
         mean = 0.5 * (e_uu + e_vv)
         out[k, 0], out[k, 1] = u0 + x[0] * radius, v0 + x[1] * radius
-        out[k, 2], out[k, 3], out[k, 4] = unit * c_uu, unit * c_uv, unit * c_vv
+        out[k, 2], out[k, 3], out[k, 4] = unit * c_uu + aliasing, unit * c_uv, unit * c_vv + aliasing
         out[k, 5] = radius * sqrt(mean + spread)
         out[k, 6] = radius * sqrt(max(mean - spread, 0.0))
         out[k, 7] = 0.5 * atan2(2 * e_uv, e_uu - e_vv)
-        out[k, 8] = x[5] * radius
+        out[k, 8] = blur_px
         out[k, 9], out[k, 10], out[k, 11] = x[6], x[9], sqrt(variance)
     return out
 

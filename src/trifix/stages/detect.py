@@ -100,7 +100,7 @@ def _candidates(
     """Centre and second moments (px, px²) of elliptic blobs, and how far off they may be (px)."""
     start, coarseness = [], []
     level, size = grey, 1.0
-    while size == 1 or _LEVEL_MIN_PX * size <= options.max_diameter_px:
+    while size == 1 or (_LEVEL_MIN_PX * size <= options.max_diameter_px and min(level.shape) > _LEVEL_MIN_PX):
         if _LEVEL_MAX_PX * size >= options.min_diameter_px:
             threshold = _threshold(level, sign, options.min_contrast)
             least = max(0.7 * options.min_diameter_px / size, 0.0 if size == 1 else _LEVEL_MIN_PX)
@@ -116,7 +116,8 @@ def _candidates(
             start.append(found[:, :5] * [size, size, size**2, size**2, size**2])
             start[-1][:, :2] += (size - 1) / 2
             coarseness.append(np.full(len(found), 0.5 * (size - 1)))
-        level = cv2.resize(level, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
+        h, w = level.shape
+        level = cv2.resize(level[: h - h % 2, : w - w % 2], (w // 2, h // 2), interpolation=cv2.INTER_AREA)
         size *= 2
     return np.concatenate(start), np.concatenate(coarseness)
 
