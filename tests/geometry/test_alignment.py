@@ -5,7 +5,7 @@ from hypothesis import strategies as st
 from scipy.special import chdtri
 from strategies import LAW, points_before, poses
 
-from trifix.geometry.alignment import align, align_weighted
+from trifix.geometry.alignment import align, align_weighted, spread_off_line_mm
 from trifix.geometry.pose import Pose
 
 MIRROR = np.diag([1.0, 1.0, -1.0])
@@ -142,3 +142,20 @@ def test_undetermined_poses_raise() -> None:
     two = points_before(np.random.default_rng(7), 2)
     with pytest.raises(np.linalg.LinAlgError, match="fewer than three"):
         align_weighted(two, two, cov[:2], cov[:2])
+
+
+@LAW
+@given(T=poses(), seed=st.integers(0, 99))
+def test_spread_off_a_line_is_the_rms_distance_from_it_wherever_it_lies(T: Pose, seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    along, angle = rng.uniform(-100, 100, 40), rng.uniform(0, 2 * np.pi, 20)
+    across = 2.0 * np.c_[np.cos(angle), np.sin(angle)]
+    p = np.c_[np.r_[along[:20], along[:20]], np.r_[across, -across]]  # pairs on a tube of radius 2 about the x axis
+    assert spread_off_line_mm(T.apply(p)) <= 2.0 + 1e-9
+    assert spread_off_line_mm(T.apply(p)) > 1.9
+    assert spread_off_line_mm(T.apply(p * [1, 0, 0])) < 1e-9
+
+
+def test_fewer_than_three_points_have_no_spread_off_a_line() -> None:
+    assert spread_off_line_mm(np.zeros((0, 3))) == 0.0
+    assert spread_off_line_mm(np.array([[0.0, 0, 0], [5, 5, 5]])) == 0.0
