@@ -7,7 +7,7 @@ import difflib
 import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TypeAlias, TypeVar, get_args
+from typing import TypeVar, get_args
 
 import numpy as np
 import yaml
@@ -24,7 +24,6 @@ _SHORTEST_BASELINE_MM = 1e-3
 _MODELS: tuple[DistortionModel, ...] = get_args(DistortionModel)
 _COEFFICIENTS: Mapping[DistortionModel, tuple[int, ...]] = {"none": (0,), "radtan": (4, 5), "equidistant": (4,)}
 
-Yaml: TypeAlias = str | float | Sequence["Yaml"] | Mapping[str, "Yaml"] | None
 Choice = TypeVar("Choice", bound=str)
 
 
@@ -35,7 +34,7 @@ def read_rig(path: Path) -> StereoRig:
         CalibrationError: the file is missing, is no camchain, or holds an impossible value.
     """
     try:
-        content: Yaml = yaml.load(read_text(path, CalibrationError), Loader=yaml.CSafeLoader)
+        content: object = yaml.load(read_text(path, CalibrationError), Loader=yaml.CSafeLoader)
     except yaml.YAMLError as fault:
         raise CalibrationError(f"{path} is not YAML: {' '.join(str(fault).split())}.") from None
     chain = _mapping(content, path, "the file")
@@ -68,7 +67,7 @@ def _camera_yaml(camera: Camera) -> dict[str, str | list[float] | list[int]]:
     }
 
 
-def _camera(camera: Mapping[str, Yaml], path: Path, name: str) -> Camera:
+def _camera(camera: Mapping[str, object], path: Path, name: str) -> Camera:
     _choice(camera, "camera_model", ("pinhole",), path, name)
     model = _choice(camera, "distortion_model", _MODELS, path, name)
     coefficients = (
@@ -90,7 +89,7 @@ def _camera(camera: Mapping[str, Yaml], path: Path, name: str) -> Camera:
     return Camera(fu, fv, pu, pv, int(width), int(height), model, tuple(coefficients))
 
 
-def _pose(camera: Mapping[str, Yaml], path: Path) -> Pose:
+def _pose(camera: Mapping[str, object], path: Path) -> Pose:
     """``T_right_left`` (mm) of the 4x4 matrix ``T_cn_cnm1`` (metres)."""
     key = "cam1.T_cn_cnm1"
     rows = _sequence(_get(camera, "T_cn_cnm1", path, "cam1."), path, key)
@@ -122,7 +121,7 @@ def _nearest_rotation(R: Float[np.ndarray, "3 3"]) -> Float[np.ndarray, "3 3"]:
     return np.asarray(U @ Vt)
 
 
-def _get(mapping: Mapping[str, Yaml], key: str, path: Path, prefix: str) -> Yaml:
+def _get(mapping: Mapping[str, object], key: str, path: Path, prefix: str) -> object:
     if key not in mapping:
         raise CalibrationError(
             f"{path}: key '{prefix}{key}' is missing, found {', '.join(map(str, mapping)) or 'none'}; "
@@ -131,19 +130,19 @@ def _get(mapping: Mapping[str, Yaml], key: str, path: Path, prefix: str) -> Yaml
     return mapping[key]
 
 
-def _mapping(value: Yaml, path: Path, name: str) -> Mapping[str, Yaml]:
+def _mapping(value: object, path: Path, name: str) -> Mapping[str, object]:
     if not isinstance(value, Mapping):
         raise CalibrationError(f"{path}: {name} holds {_short(value)}, expected keys and values of a Kalibr camchain.")
     return value
 
 
-def _sequence(value: Yaml, path: Path, name: str) -> Sequence[Yaml]:
+def _sequence(value: object, path: Path, name: str) -> Sequence[object]:
     if isinstance(value, str) or not isinstance(value, Sequence):
         raise CalibrationError(f"{path}, {name}: found {_short(value)}, expected a list.")
     return value
 
 
-def _choice(camera: Mapping[str, Yaml], key: str, known: tuple[Choice, ...], path: Path, name: str) -> Choice:
+def _choice(camera: Mapping[str, object], key: str, known: tuple[Choice, ...], path: Path, name: str) -> Choice:
     value = _get(camera, key, path, f"{name}.")
     if isinstance(value, str) and value in known:
         return known[known.index(value)]
@@ -154,11 +153,11 @@ def _choice(camera: Mapping[str, Yaml], key: str, known: tuple[Choice, ...], pat
     )
 
 
-def _numbers(camera: Mapping[str, Yaml], key: str, counts: tuple[int, ...], path: Path, name: str) -> list[float]:
+def _numbers(camera: Mapping[str, object], key: str, counts: tuple[int, ...], path: Path, name: str) -> list[float]:
     return _number_list(_get(camera, key, path, f"{name}."), counts, path, f"{name}.{key}")
 
 
-def _number_list(value: Yaml, counts: tuple[int, ...], path: Path, name: str) -> list[float]:
+def _number_list(value: object, counts: tuple[int, ...], path: Path, name: str) -> list[float]:
     """The finite numbers of a list that has one of these lengths."""
     values = _sequence(value, path, name)
     if len(values) not in counts:
@@ -168,7 +167,7 @@ def _number_list(value: Yaml, counts: tuple[int, ...], path: Path, name: str) ->
     return [_number(x, path, name) for x in values]
 
 
-def _number(value: Yaml, path: Path, name: str) -> float:
+def _number(value: object, path: Path, name: str) -> float:
     """A finite number; text too, as YAML 1.1 takes 1e-05 (no point) for text."""
     try:
         number = math.nan if isinstance(value, bool) or not isinstance(value, str | int | float) else float(value)
@@ -179,6 +178,6 @@ def _number(value: Yaml, path: Path, name: str) -> float:
     return number
 
 
-def _short(value: Yaml) -> str:
+def _short(value: object) -> str:
     text = repr(value)
     return text if len(text) <= 60 else text[:57] + "..."

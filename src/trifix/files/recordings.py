@@ -5,10 +5,10 @@ frame makes that frame ``Unusable`` and leaves the others alone. Tables are pars
 their frame is asked for.
 """
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal, Protocol
+from typing import Literal
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -40,12 +40,7 @@ _LATERAL_PER_MM = 1e-3  # sigma of a point across its ray, without a rig: as see
 _LENGTHENING = 5.0  # and along the ray, in units of that
 
 
-class Source(Protocol):
-    """What a level must be able to do: give the content of the k-th frame as seen with a rig."""
-
-    def content(self, k: int, rig: StereoRig | None) -> StereoImages | StereoDots | SensorPoints | Unusable:
-        """The content of the k-th frame."""
-        ...
+Content = StereoImages | StereoDots | SensorPoints | Unusable
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -66,8 +61,8 @@ class Recording:
     """The rig of all frames that have none of their own."""
     rigs: Mapping[int, StereoRig]
     """The rigs of frames that have one of their own, by position."""
-    source: Source
-    """Where the contents come from."""
+    content: Callable[[int, StereoRig | None], Content]
+    """Reads what the k-th frame saw with its rig."""
 
     def __len__(self) -> int:
         return len(self.index)
@@ -83,7 +78,7 @@ class Recording:
         if rig is None and self.level != "points":
             detail = f"{self.path / 'calibrations' / f'{stamp}.yaml'} does not exist, and there is no calibration.yaml."
             return Frame(int(self.index[k]), stamp, None, Unusable(Reason.no_calibration, detail))
-        return Frame(int(self.index[k]), stamp, rig, self.source.content(k, rig))
+        return Frame(int(self.index[k]), stamp, rig, self.content(k, rig))
 
 
 def read_recording(path: Path, level: Level | None = None, sigma_px: float = 0.3) -> Recording:
@@ -138,7 +133,7 @@ def _open_images(path: Path) -> Recording:
     source = _Images(pairs)
     rig, rigs = _read_rigs(path, timestamp_ns, is_needed=True)
     _check_first_sizes(source, [rigs.get(k, rig) for k in range(len(index))])
-    return Recording(path, "images", index, timestamp_ns, False, rig, rigs, source)
+    return Recording(path, "images", index, timestamp_ns, False, rig, rigs, source.content)
 
 
 def _open_dots(path: Path, sigma_px: float) -> Recording:
@@ -161,7 +156,8 @@ def _open_dots(path: Path, sigma_px: float) -> Recording:
     is_noise_stated = "sigma_px" in table
     n = len(position)
     sigma = table["sigma_px"] if is_noise_stated else np.full(n, sigma_px)
-    order = np.argsort(2 * position + camera, kind="stable")
+    image = 2 * position + camera
+    order = np.argsort(image, kind="stable")
     dots = Dots(
         uv_px=np.stack([table["u"], table["v"]], axis=1)[order],
         cov_px2=(sigma[:, None, None] ** 2 * np.eye(2))[order],
@@ -171,11 +167,11 @@ def _open_dots(path: Path, sigma_px: float) -> Recording:
     )
     source = _DotTable(
         dots,
-        start=np.searchsorted((2 * position + camera)[order], np.arange(2 * len(index) + 1)),
+        start=np.searchsorted(image[order], np.arange(2 * len(index) + 1)),
         faults=_faults(file, table, ("u", "v", "sigma_px"), position),
     )
     rig, rigs = _read_rigs(path, timestamp_ns, is_needed=True)
-    return Recording(path, "dots", index, timestamp_ns, is_noise_stated, rig, rigs, source)
+    return Recording(path, "dots", index, timestamp_ns, is_noise_stated, rig, rigs, source.content)
 
 
 def _open_points(path: Path, sigma_px: float) -> Recording:
@@ -215,7 +211,7 @@ def _open_points(path: Path, sigma_px: float) -> Recording:
     start = np.searchsorted(position[order], np.arange(len(index) + 1))
     rig, rigs = _read_rigs(path, timestamp_ns, is_needed=False)
     source = _PointTable(points, start, faults, sigma_px)
-    return Recording(path, "points", index, timestamp_ns, is_noise_stated, rig, rigs, source)
+    return Recording(path, "points", index, timestamp_ns, is_noise_stated, rig, rigs, source.content)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
