@@ -174,6 +174,7 @@ def test_written_dots_read_back_in_their_order(tmp_path: Path) -> None:
         camera,
         uv,
         sigma_px=sigma,
+        diameter_px=2 * np.sqrt(ellipse[:, 0] * ellipse[:, 1]),
         ellipse=ellipse,
         label=label,
     )
@@ -460,8 +461,20 @@ def test_a_broken_calibration_of_a_frame_is_named(tmp_path: Path) -> None:
         read_recording(tmp_path)
 
 
-def test_dots_of_circles_keep_their_type() -> None:
-    dots = Dots.of(np.zeros((2, 2)), diameter_px=np.array([4.0, 6.0]))
-    (row, *_), n = dots_rows(3, 5, StereoDots(dots, dots)), 4
-    assert row == "3,5,0,0.000000,0.000000,0.300000,4.000000,2.000000,2.000000,0.000000,"
-    assert len(dots_rows(3, 5, StereoDots(dots, dots))) == n
+def test_written_dots_have_only_the_columns_that_were_given(tmp_path: Path) -> None:
+    one = np.array([1])
+    write_dots(tmp_path / "dots.csv", one, one, one, np.array([[1.5, -0.25]]), diameter_px=np.array([8.0]))
+    assert (tmp_path / "dots.csv").read_text() == (
+        "frame,timestamp_ns,camera,u,v,diameter_px\n1,1,1,1.500000,-0.250000,8.000000\n"
+    )
+
+
+def test_the_rows_of_a_frame_hold_every_column_left_before_right() -> None:
+    left, right = Dots.of(np.zeros((2, 2)), diameter_px=np.array([4.0, 6.0])), Dots.of(np.ones((1, 2)))
+    rows = dots_rows(3, 5, StereoDots(left, right))
+    assert DOTS_HEADER == "frame,timestamp_ns,camera,u,v,sigma_px,diameter_px,a_px,b_px,theta_rad,label"
+    assert rows == [
+        "3,5,0,0.000000,0.000000,0.300000,4.000000,2.000000,2.000000,0.000000,",
+        "3,5,0,0.000000,0.000000,0.300000,6.000000,3.000000,3.000000,0.000000,",
+        "3,5,1,1.000000,1.000000,0.300000,,,,0.000000,",
+    ]

@@ -416,11 +416,12 @@ def write_dots(
     uv_px: Float[np.ndarray, "m 2"],
     *,
     sigma_px: Float[np.ndarray, "m"] | None = None,
+    diameter_px: Float[np.ndarray, "m"] | None = None,
     ellipse: Float[np.ndarray, "m 3"] | None = None,
     label: Int[np.ndarray, "m"] | None = None,
 ) -> None:
     """Writes dots.csv, a row a dot; the optional columns only where they are given."""
-    write_table(path, _dot_columns(index, timestamp_ns, camera, uv_px, sigma_px, ellipse, label))
+    write_table(path, _dot_columns(index, timestamp_ns, camera, uv_px, sigma_px, diameter_px, ellipse, label))
 
 
 def write_points(
@@ -457,6 +458,7 @@ def dots_rows(index: int, timestamp_ns: int, dots: StereoDots) -> list[str]:
         camera,
         np.concatenate([left.uv_px, right.uv_px]),
         np.sqrt(np.trace(np.concatenate([left.cov_px2, right.cov_px2]), axis1=1, axis2=2) / 2),
+        np.concatenate([left.diameter_px, right.diameter_px]),
         np.concatenate([left.ellipse, right.ellipse]),
         np.concatenate([left.label, right.label]),
     )
@@ -469,6 +471,7 @@ def _dot_columns(
     camera: Int[np.ndarray, "m"],
     uv_px: Float[np.ndarray, "m 2"],
     sigma_px: Float[np.ndarray, "m"] | None,
+    diameter_px: Float[np.ndarray, "m"] | None,
     ellipse: Float[np.ndarray, "m 3"] | None,
     label: Int[np.ndarray, "m"] | None,
 ) -> dict[str, list[str]]:
@@ -482,8 +485,9 @@ def _dot_columns(
     }
     if sigma_px is not None:
         columns["sigma_px"] = _decimals(sigma_px)
+    if diameter_px is not None:
+        columns["diameter_px"] = _decimals(diameter_px)
     if ellipse is not None:
-        columns["diameter_px"] = _decimals(2 * np.sqrt(ellipse[:, 0] * ellipse[:, 1]))
         columns |= {name: _decimals(ellipse[:, i]) for i, name in enumerate(("a_px", "b_px", "theta_rad"))}
     if label is not None:
         columns["label"] = _labels(label)
