@@ -341,13 +341,14 @@ def test_images_become_frames_with_the_rig(tmp_path: Path) -> None:
         assert frame.rig is recording.rig is not None
 
 
-def test_a_truncated_image_spoils_its_frame_alone(tmp_path: Path) -> None:
+@pytest.mark.parametrize(("side", "k"), [(0, 0), (1, 1)])
+def test_a_truncated_image_spoils_its_frame_alone(tmp_path: Path, side: int, k: int) -> None:
     write_euroc(tmp_path)
-    path = tmp_path / "cam1" / "data" / f"{STAMPS[1]}.png"
+    path = tmp_path / f"cam{side}" / "data" / f"{STAMPS[k]}.png"
     path.write_bytes(path.read_bytes()[:-40])
     recording = read_recording(tmp_path)
-    assert kinds(recording) == ["StereoImages", "Unusable", "StereoImages"]
-    content = unusable(recording.frame(1))
+    assert [i for i, frame in enumerate(recording) if isinstance(frame.content, Unusable)] == [k]
+    content = unusable(recording.frame(k))
     assert content.reason is Reason.unreadable_image
     assert str(path) in content.detail
 
@@ -367,7 +368,9 @@ def test_images_of_another_size_than_the_calibration_are_refused(tmp_path: Path)
     write_euroc(tmp_path)
     text = (tmp_path / "calibration.yaml").read_text()
     (tmp_path / "calibration.yaml").write_text(text.replace(f"[{SIZE[0]}, {SIZE[1]}]", "[640, 480]"))
-    with pytest.raises(RecordingError, match="the left image is 32 x 24 pixels, its calibration is for 640 x 480"):
+    with pytest.raises(
+        RecordingError, match="image pair 0: the left image is 32 x 24 pixels, its calibration is for 640 x 480"
+    ):
         read_recording(tmp_path)
 
 
@@ -443,6 +446,19 @@ def test_a_frame_without_calibration_is_refused_where_others_have_theirs(tmp_pat
     assert frame.rig is None
     assert unusable(frame).reason is Reason.no_calibration
     assert "1080000000.yaml does not exist, and there is no calibration.yaml" in unusable(frame).detail
+
+
+def test_image_pairs_without_calibration_are_refused_where_others_have_theirs(tmp_path: Path) -> None:
+    write_euroc(tmp_path)
+    (tmp_path / "calibrations").mkdir()
+    (tmp_path / "calibration.yaml").rename(tmp_path / "calibrations" / f"{STAMPS[1]}.yaml")
+    recording = read_recording(tmp_path)
+    assert kinds(recording) == ["Unusable", "StereoImages", "Unusable"]
+    assert unusable(recording.frame(0)).reason is Reason.no_calibration
+    own = tmp_path / "calibrations" / f"{STAMPS[1]}.yaml"
+    own.write_text(own.read_text().replace(f"[{SIZE[0]}, {SIZE[1]}]", "[640, 480]"))
+    with pytest.raises(RecordingError, match="image pair 1: the left image is 32 x 24 pixels"):
+        read_recording(tmp_path)
 
 
 def test_calibrations_of_other_frames_only_are_refused(tmp_path: Path) -> None:

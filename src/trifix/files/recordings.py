@@ -132,7 +132,8 @@ def _open_images(path: Path) -> Recording:
             )
     source = _Images(pairs)
     rig, rigs = _read_rigs(path, timestamp_ns, is_needed=True)
-    _check_first_sizes(source, [rigs.get(k, rig) for k in range(len(index))])
+    rig_of = {k: own for k in range(len(index)) if (own := rigs.get(k, rig)) is not None}
+    _check_first_sizes(source, rig_of)
     return Recording(path, "images", index, timestamp_ns, False, rig, rigs, source.content)
 
 
@@ -221,9 +222,12 @@ class _Images:
     pairs: ImagePairs
 
     def content(self, k: int, rig: StereoRig | None) -> StereoImages | Unusable:
+        assert rig is not None  # a frame without calibration is refused before its images are decoded
         images = self.decode(k)
-        fault = images if isinstance(images, str) else _size_fault(images, rig)
-        return images if isinstance(images, StereoImages) and not fault else Unusable(Reason.unreadable_image, fault)
+        if isinstance(images, str):
+            return Unusable(Reason.unreadable_image, images)
+        fault = _size_fault(images, rig)
+        return Unusable(Reason.unreadable_image, fault) if fault else images
 
     def decode(self, k: int) -> StereoImages | str:
         """The images, or why they cannot be had."""
@@ -323,10 +327,8 @@ def _read_rigs(
     return rig, rigs
 
 
-def _size_fault(images: StereoImages, rig: StereoRig | None) -> str:
+def _size_fault(images: StereoImages, rig: StereoRig) -> str:
     """What is wrong with the sizes of a pair; empty if nothing is."""
-    if rig is None:
-        return ""
     for side, image, camera in (("left", images.left, rig.left), ("right", images.right, rig.right)):
         height, width = image.shape[:2]
         if (width, height) != (camera.width_px, camera.height_px):
@@ -337,20 +339,20 @@ def _size_fault(images: StereoImages, rig: StereoRig | None) -> str:
     return ""
 
 
-def _check_first_sizes(source: _Images, rigs: list[StereoRig | None]) -> None:
+def _check_first_sizes(source: _Images, rigs: Mapping[int, StereoRig]) -> None:
     """Refuses a recording whose first two readable pairs have wrong sizes; a single odd one is its frame's fault."""
     faults: list[str] = []
-    for k, rig in enumerate(rigs):
+    for k, rig in rigs.items():
         images = source.decode(k)
-        if isinstance(images, str):
-            continue
-        faults.append(_size_fault(images, rig))
-        if not faults[-1]:
-            return
-        if len(faults) == 2:
-            break
+        if isinstance(images, StereoImages):
+            fault = _size_fault(images, rig)
+            if not fault:
+                return
+            faults.append(f"image pair {k}: {fault}")
+            if len(faults) == 2:
+                break
     if faults:
-        raise RecordingError(f"frame 0: {faults[0]}")
+        raise RecordingError(faults[0])
 
 
 def _positions(
