@@ -14,7 +14,7 @@ from trifix.geometry.camera import StereoRig
 from trifix.geometry.pose import Pose
 
 GreyOrColour = (
-    UInt8[np.ndarray, "h w"] | UInt16[np.ndarray, "h w"] | UInt8[np.ndarray, "h w 3"] | UInt16[np.ndarray, "h w 3"]
+    UInt8[np.ndarray, "_ _"] | UInt16[np.ndarray, "_ _"] | UInt8[np.ndarray, "_ _ 3"] | UInt16[np.ndarray, "_ _ 3"]
 )
 
 
@@ -198,6 +198,8 @@ class ReferenceMap:
     """Frames in which it was seen."""
     last_seen: Int[np.ndarray, "k"]
     """Index of the newest frame that saw it; -1 if none did."""
+    misses: Int[np.ndarray, "k"]
+    """Frames that should have seen it and did not."""
     state: Int[np.ndarray, "k"]
     """A ``TargetState``."""
 
@@ -218,23 +220,21 @@ class ReferenceMap:
             self.view.copy(),
             self.sightings.copy(),
             self.last_seen.copy(),
+            self.misses.copy(),
             self.state.copy(),
         )
 
     @staticmethod
     def empty() -> "ReferenceMap":
         """A map without targets."""
-        none = np.zeros(0, dtype=np.int64)
-        return ReferenceMap(
-            none, np.zeros((0, 3)), np.zeros((0, 3, 3)), np.zeros((0, 3)), none.copy(), none.copy(), none.copy()
-        )
+        return ReferenceMap.given(np.zeros((0, 3)))
 
     @staticmethod
     def given(
         xyz_mm: Float[np.ndarray, "k 3"],
         cov_mm2: Float[np.ndarray, "k 3 3"] | None = None,
         view: Float[np.ndarray, "k 3"] | None = None,
-        id: Int[np.ndarray, "k"] | None = None,  # noqa: A002  (the column's name in map.csv)
+        id: Int[np.ndarray, "k"] | None = None,
         sightings: Int[np.ndarray, "k"] | None = None,
         state: Int[np.ndarray, "k"] | None = None,
     ) -> "ReferenceMap":
@@ -247,6 +247,7 @@ class ReferenceMap:
             view=np.full((k, 3), np.nan) if view is None else view,
             sightings=np.zeros(k, dtype=np.int64) if sightings is None else sightings,
             last_seen=np.full(k, -1),
+            misses=np.zeros(k, dtype=np.int64),
             state=np.full(k, int(TargetState.trusted)) if state is None else state,
         )
 
@@ -264,6 +265,20 @@ class Identification:
 
     def __len__(self) -> int:
         return len(self.point)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Orientations:
+    """The poses that h hypotheses lead to."""
+
+    R: Float[np.ndarray, "h 3 3"]
+    """Rotations of ``T_world_sensor``."""
+    t_mm: Float[np.ndarray, "h 3"]
+    """Translations (mm)."""
+    cov: Float[np.ndarray, "h 6 6"]
+    """Covariances of δ = (translation mm, rotation rad), T · exp(δ)."""
+    is_valid: Bool[np.ndarray, "h"]
+    """False where the pairs lie on one line and determine no pose."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

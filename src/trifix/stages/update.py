@@ -1,0 +1,185 @@
+"""Reference map x fix -> reference map (the paper's parts P6 and P10).
+
+Known targets are averaged with the new sighting by covariance (a Kalman filter a target), new points enter, and what
+was seen once and never again although it should have been, goes. Knows no image.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from trifix.errors import ConfigError
+from trifix.geometry.camera import StereoRig
+from trifix.geometry.pose import Pose, skew
+from trifix.records import Fix, ReferenceMap, SensorPoints, StereoMatches, TargetState
+
+
+@dataclass(frozen=True, slots=True)
+class UpdateOptions:
+    """How the map grows and what it drops."""
+
+    trusted_after: int = 3
+    """Sightings after which a target is trusted."""
+    new_target_sigmas: float = 6.0
+    """A point enters as a new target only if it is farther than this from every known one (Mahalanobis)."""
+    max_misses: int = 8
+    """Frames that may miss a provisional target before it is dropped; 0 keeps everything."""
+
+    def __post_init__(self) -> None:
+        if self.trusted_after < 1 or self.max_misses < 0 or self.new_target_sigmas < 0:
+            raise ConfigError("update.trusted_after must be at least 1, max_misses and new_target_sigmas at least 0.")
+
+
+def found_map(points: SensorPoints, frame_index: int) -> tuple[ReferenceMap, np.ndarray]:
+    """The map of the first frame, whose sensor coordinates become the world's, and the rows of its targets."""
+    return _with_points(ReferenceMap.empty(), points, np.arange(len(points)), Pose.identity(), None, frame_index, 0)
+
+
+def update(
+    map: ReferenceMap,
+    points: SensorPoints,
+    matches: StereoMatches | None,
+    fix: Fix,
+    frame_index: int,
+    rig: StereoRig | None,
+    next_id: int,
+    options: UpdateOptions = UpdateOptions(),
+) -> tuple[ReferenceMap, Int[np.ndarray, "a"]]:
+    """The map after a fix, and the rows of the targets that entered it; the given map is left as it was."""
+    map = map.copy()
+    T = fix.T_world_sensor
+    p, q = fix.point, fix.target
+    cov_world = world_covariance(points.xyz_mm[p], points.cov_mm2[p], T, fix.cov)
+
+    # Kalman update of each target: K = C (C + C_seen)⁻¹
+    C = map.cov_mm2[q]
+    K = np.swapaxes(np.linalg.solve(C + cov_world, C), 1, 2)
+    map.xyz_mm[q] += (K @ (T.apply(points.xyz_mm[p]) - map.xyz_mm[q])[:, :, None])[:, :, 0]
+    updated = C - K @ C
+    map.cov_mm2[q] = 0.5 * (updated + np.swapaxes(updated, 1, 2))
+    towards = _unit(T.t_mm - map.xyz_mm[q])
+    seen = map.sightings[q, None]
+    map.view[q] = _unit(np.where(np.isfinite(map.view[q]), map.view[q] * np.maximum(seen, 1), 0.0) + towards)
+    map.sightings[q] += 1
+    map.last_seen[q] = frame_index
+    is_proven = (map.state[q] == TargetState.provisional) & (map.sightings[q] >= options.trusted_after)
+    map.state[q[is_proven]] = TargetState.trusted
+
+    missed = expected(map, points, T, rig)
+    missed[q] = False
+    map.misses[missed] += 1
+    if options.max_misses:
+        is_ghost = (map.state == TargetState.provisional) & (map.misses > options.max_misses * map.sightings)
+        map.state[is_ghost] = TargetState.removed
+
+    new = _new_points(map, points, matches, fix, options)
+    return _with_points(map, points, new, T, fix.cov, frame_index, next_id)
+
+
+def world_covariance(
+    xyz_mm: Float[np.ndarray, "n 3"], cov_mm2: Float[np.ndarray, "n 3 3"], T: Pose, cov: Float[np.ndarray, "6 6"] | None
+) -> Float[np.ndarray, "n 3 3"]:
+    """Covariance in world coordinates of points seen from an uncertain pose: R (C + J P Jᵀ) Rᵀ with J = [I, −[p]×]."""
+    total = cov_mm2
+    if cov is not None:
+        J = np.zeros((len(xyz_mm), 3, 6))
+        J[:, :, :3] = np.eye(3)
+        for row, p in enumerate(xyz_mm):
+            J[row, :, 3:] = -skew(p)
+        total = cov_mm2 + J @ cov @ np.swapaxes(J, 1, 2)
+    return np.asarray(T.R @ total @ T.R.T)
+
+
+def expected(
+    map: ReferenceMap,
+    points: SensorPoints,
+    T_world_sensor: Pose,
+    rig: StereoRig | None,
+) -> Bool[np.ndarray, "k"]:
+    """Which living targets the frame should have seen: facing the sensor, in the image of both cameras.
+
+    Without a rig, the box of slopes and depths that the frame's points fill stands for the field of view.
+    """
+    xyz = T_world_sensor.inverse().apply(map.xyz_mm)
+    facing = np.einsum("ni,ni->n", map.view, _unit(T_world_sensor.t_mm - map.xyz_mm))
+    out = map.alive & ~(facing < 0.5)
+    if rig is not None:
+        out &= rig.left.sees(xyz, margin_px=10) & rig.right.sees(rig.T_right_left.apply(xyz), margin_px=10)
+    depth = points.xyz_mm[:, 2]
+    out &= (xyz[:, 2] >= depth.min(initial=np.inf)) & (xyz[:, 2] <= depth.max(initial=-np.inf))
+    if rig is None and len(points):
+        slope, seen = xyz[:, :2] / xyz[:, 2:], points.xyz_mm[:, :2] / points.xyz_mm[:, 2:]
+        out &= ((slope >= seen.min(axis=0)) & (slope <= seen.max(axis=0))).all(axis=1)
+    return np.asarray(out)
+
+
+def _new_points(
+    map: ReferenceMap,
+    points: SensorPoints,
+    matches: StereoMatches | None,
+    fix: Fix,
+    options: UpdateOptions,
+) -> Int[np.ndarray, "a"]:
+    """Points that are no known target and share no dot with one that is."""
+    from scipy.spatial import cKDTree
+
+    is_free = np.ones(len(points), dtype=np.bool_)
+    is_free[fix.point] = False
+    if matches is not None:
+        left, right = matches.left[points.match], matches.right[points.match]
+        is_free &= ~np.isin(left, left[fix.point]) & ~np.isin(right, right[fix.point])
+    new = np.flatnonzero(is_free)
+    alive = np.flatnonzero(map.alive)
+    if len(new) == 0 or len(alive) == 0:
+        return new
+    world = fix.T_world_sensor.apply(points.xyz_mm[new])
+    C = world_covariance(points.xyz_mm[new], points.cov_mm2[new], fix.T_world_sensor, fix.cov)
+    _, nearest = cKDTree(map.xyz_mm[alive]).query(world, k=min(4, len(alive)))
+    nearest = alive[np.asarray(nearest).reshape(len(new), -1)]
+    r = map.xyz_mm[nearest] - world[:, None]
+    d2 = np.einsum("nki,nki->nk", r, np.linalg.solve(C[:, None] + map.cov_mm2[nearest], r[..., None])[..., 0])
+    return np.asarray(new[(d2 > options.new_target_sigmas**2).all(axis=1)])
+
+
+def _with_points(
+    map: ReferenceMap,
+    points: SensorPoints,
+    new: Int[np.ndarray, "a"],
+    T: Pose,
+    cov: Float[np.ndarray, "6 6"] | None,
+    frame_index: int,
+    next_id: int,
+) -> tuple[ReferenceMap, Int[np.ndarray, "a"]]:
+    """The map with some points as new provisional targets, in the rows of removed ones first."""
+    vacant = np.flatnonzero(map.state == TargetState.removed)[: len(new)]
+    rows = np.concatenate([vacant, np.arange(len(map), len(map) + len(new) - len(vacant))])
+    extra = len(new) - len(vacant)
+    map = ReferenceMap(
+        *(
+            np.concatenate([a, np.zeros((extra, *a.shape[1:]), dtype=a.dtype)]) if extra else a
+            for a in (
+                map.id,
+                map.xyz_mm,
+                map.cov_mm2,
+                map.view,
+                map.sightings,
+                map.last_seen,
+                map.misses,
+                map.state,
+            )
+        )
+    )
+    map.id[rows] = np.arange(next_id, next_id + len(new))
+    map.xyz_mm[rows] = T.apply(points.xyz_mm[new])
+    map.cov_mm2[rows] = world_covariance(points.xyz_mm[new], points.cov_mm2[new], T, cov)
+    map.view[rows] = _unit(T.t_mm - map.xyz_mm[rows])
+    map.sightings[rows] = 1
+    map.last_seen[rows] = frame_index
+    map.misses[rows] = 0
+    map.state[rows] = TargetState.provisional
+    return map, rows
+
+
+def _unit(v: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
+    return np.asarray(v / np.maximum(np.linalg.norm(v, axis=1, keepdims=True), 1e-12))
