@@ -1,13 +1,15 @@
 """Compiled loops of the detector: connected blobs with their moments, and an ellipse fitted to grey values.
 
-Knows float32 images and numbers; which blob is worth being called a dot is decided by the stage.
+Knows grey values and numbers; which blob is worth being called a dot is decided by the stage.
 """
 
-from math import atan2, erfc, exp, log, pi, sqrt
+from math import atan2, exp, log, pi, sqrt
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, UInt8, UInt16
 from numba import njit
+
+Grey = UInt8[np.ndarray, "h w"] | UInt16[np.ndarray, "h w"]
 
 BLOB_COLUMNS = 6
 """u, v, the second moments uu, uv, vv of the blob's area (px²), and its fill: area over that of the ellipse."""
@@ -19,14 +21,14 @@ FIT_COLUMNS = 12
 # surround (3), level and gradient of the step (3).
 _N = 12
 # The prior knowledge, each as a standard deviation.
-_LIGHT_PER_PX = 0.003  # relative change of the light per pixel
+_LIGHT_PER_PX = 0.002  # relative change of the light per pixel
 _OFFSET_PER_PX = 0.001  # departure from light that multiplies both sides of the edge alike, in contrasts per pixel
 _LOG_BLUR = 0.8  # spread of the edge's blur about _BLUR_PX
 _BLUR_PX = 0.8
 _MIN_BLUR_PX = 0.29  # the pixel's own aperture: 1/sqrt(12)
 _QUANTISATION_VARIANCE = 1.0 / 12.0
 _ALIASING_PX2 = 0.013**2
-_SOLID_RADIUS_PX = 8  # of larger dots only a band along the edge is looked at
+_SOLID_RADIUS_PX = 12.0  # of larger dots only a band along the edge is looked at
 _ENOUGH = 400  # pixels for the first, rough fit
 
 
@@ -39,17 +41,27 @@ def _root(parent: np.ndarray, i: int) -> int:
 
 
 @njit(cache=True, nogil=True)
+def _is_beyond(value: float, darkest: float, brightest: float, sign: float, min_contrast: float) -> bool:
+    lowest, highest = np.float32(darkest), np.float32(brightest)
+    return bool(highest - lowest > min_contrast * highest and sign * (2 * np.float32(value) - lowest - highest) > 0)
+
+
+@njit(cache=True, nogil=True)
 def blobs(
-    image: Float[np.ndarray, "h w"],
-    threshold: Float[np.ndarray, "h w"],
+    image: Grey,
+    darkest: Grey,
+    brightest: Grey,
     sign: float,
+    min_contrast: float,
     min_diameter_px: float,
     max_diameter_px: float,
     min_axis_ratio: float,
     min_fill: float,
 ) -> Float[np.ndarray, "m 6"]:
-    """Blobs of pixels with sign·(image − threshold) > 0, 4-connected, away from the border, roughly elliptic.
+    """Blobs of pixels beyond the local threshold, 4-connected, away from the border, roughly elliptic.
 
+    The threshold lies midway between the darkest and the brightest pixel about (Bernsen 1986), where these differ by
+    ``min_contrast`` of the brighter. ``sign`` is +1 for bright blobs, -1 for dark ones.
     Labels runs of pixels rather than pixels (He, Chao & Suzuki 2008), so that moments come in closed form.
     """
     h, w = image.shape
@@ -64,11 +76,11 @@ def blobs(
         start = n
         u = 0
         while u < w:
-            if sign * (image[v, u] - threshold[v, u]) <= 0:
+            if not _is_beyond(image[v, u], darkest[v, u], brightest[v, u], sign, min_contrast):
                 u += 1
                 continue
             u0 = u
-            while u < w and sign * (image[v, u] - threshold[v, u]) > 0:
+            while u < w and _is_beyond(image[v, u], darkest[v, u], brightest[v, u], sign, min_contrast):
                 u += 1
             row[n], first[n], last[n], parent[n] = v, u0, u - 1, n
             n += 1
@@ -211,8 +223,8 @@ def _gather(
             q = sqrt(y0 * y0 + y1 * y1)
             g0, g1 = p * y0, r * y0 + t * y1
             d = (q - 1) * q / (sqrt(g0 * g0 + g1 * g1) + 1e-12)
-            if d <= outer and d >= -inner and n < len(pixels):
-                pixels[n, 0], pixels[n, 1], pixels[n, 2] = eu, ev, image[v, u]
+            if d <= outer and d >= -inner and n < pixels.shape[1]:
+                pixels[0, n], pixels[1, n], pixels[2, n] = eu, ev, image[v, u]
                 n += 1
     return n
 
@@ -227,9 +239,52 @@ def _thin(pixels: np.ndarray, n: int) -> int:
     stride |= 1
     kept = 0
     for i in range(0, n, stride):
-        pixels[kept] = pixels[i]
+        pixels[:, kept] = pixels[:, i]
         kept += 1
     return kept
+
+
+@njit(cache=True, nogil=True)
+def _differentiate(pixels: np.ndarray, n: int, x: np.ndarray, J: np.ndarray) -> None:
+    """Fills the rows of J with the derivatives of each pixel's grey value, the last one with its residual.
+
+    Model of a grey value at ξ: B(ξ) + C(ξ) Φ(−d/s), B and C linear in ξ, d the distance from the ellipse to first
+    order, s the blur. The model is symmetric about the centre wherever B and C are level: what it gets wrong of a
+    symmetric dot does not move the centre.
+    """
+    p, r, t, s = x[2], x[3], x[4], x[5]
+    for k in range(n):
+        eu, ev = pixels[0, k], pixels[1, k]
+        du, dv = eu - x[0], ev - x[1]
+        y0, y1 = p * du + r * dv, t * dv
+        q = sqrt(y0 * y0 + y1 * y1)
+        g0, g1 = p * y0, r * y0 + t * y1
+        norm = sqrt(g0 * g0 + g1 * g1) + 1e-12
+        z = (q - 1) * q / norm / s
+        step = x[9] + x[10] * eu + x[11] * ev
+        inside, slope = 0.0 if z > 0 else 1.0, 0.0
+        if -4.5 < z < 4.5:
+            # Normal density and, from it, the normal integral to 1e-7 (Abramowitz & Stegun 1964, 26.2.17).
+            density = exp(-0.5 * z * z) * 0.3989422804014327
+            y = 1 / (1 + 0.2316419 * abs(z))
+            tail = y * (0.319381530 + y * (-0.356563782 + y * (1.781477937 + y * (-1.821255978 + y * 1.330274429))))
+            inside = density * tail if z > 0 else 1 - density * tail
+            slope = step * density / s  # −dI/dd
+        along = slope / norm
+        J[0, k], J[1, k] = along * g0, along * g1
+        J[2, k], J[3, k], J[4, k] = -along * y0 * du, -along * y0 * dv, -along * y1 * dv
+        J[5, k] = slope * z
+        J[6, k], J[7, k], J[8, k] = 1.0, eu, ev
+        J[9, k], J[10, k], J[11, k] = inside, inside * eu, inside * ev
+        J[12, k] = pixels[2, k] - (x[6] + x[7] * eu + x[8] * ev + inside * step)
+
+
+@njit(cache=True, nogil=True, fastmath={"reassoc", "contract"})
+def _product(a: np.ndarray, b: np.ndarray) -> float:
+    total = 0.0
+    for k in range(len(a)):
+        total += a[k] * b[k]
+    return total
 
 
 @njit(cache=True, nogil=True)
@@ -239,53 +294,22 @@ def _normal_equations(
     x: np.ndarray,
     radius: float,
     variance: float,
+    J: np.ndarray,
     H: np.ndarray,
     g: np.ndarray,
 ) -> float:
-    """Fills H = JᵀJ and g = Jᵀr, the prior included; returns the sum of squares (grey values²).
-
-    Model of a grey value at ξ: B(ξ) + C(ξ) Φ(−d/s), B and C linear in ξ, d the distance from the ellipse to first
-    order, s the blur. The model is symmetric about the centre wherever B and C are level: what it gets wrong of a
-    symmetric dot does not move the centre.
-    """
+    """Fills H = JᵀJ (lower triangle) and g = Jᵀr, the prior included; returns the sum of squares (grey values²)."""
+    _differentiate(pixels, n, x, J)
+    residual = J[_N, :n]
     for i in range(_N):
-        g[i] = 0.0
-        for j in range(_N):
-            H[i, j] = 0.0
-    J = np.empty(_N)
-    total = 0.0
-    p, r, t, s = x[2], x[3], x[4], x[5]
-    for k in range(n):
-        eu, ev = pixels[k, 0], pixels[k, 1]
-        du, dv = eu - x[0], ev - x[1]
-        y0, y1 = p * du + r * dv, t * dv
-        q = sqrt(y0 * y0 + y1 * y1)
-        g0, g1 = p * y0, r * y0 + t * y1
-        norm = sqrt(g0 * g0 + g1 * g1) + 1e-12
-        z = (q - 1) * q / norm / s
-        step = x[9] + x[10] * eu + x[11] * ev
-        inside = 0.0 if z > 4 else 1.0
-        start = 6
-        J[0] = J[1] = J[2] = J[3] = J[4] = J[5] = 0.0
-        if -4 < z < 4:
-            start = 0
-            inside = 0.5 * erfc(z / sqrt(2.0))
-            slope = step * exp(-0.5 * z * z) / (sqrt(2 * pi) * s)  # −dI/dd
-            J[0], J[1] = slope * g0 / norm, slope * g1 / norm
-            J[2], J[3], J[4] = -slope * y0 * du / norm, -slope * y0 * dv / norm, -slope * y1 * dv / norm
-            J[5] = slope * z
-        J[6], J[7], J[8] = 1.0, eu, ev
-        J[9], J[10], J[11] = inside, inside * eu, inside * ev
-        residual = pixels[k, 2] - (x[6] + x[7] * eu + x[8] * ev + inside * step)
-        total += residual * residual
-        for i in range(start, _N):
-            Ji = J[i]
-            g[i] += Ji * residual
-            for j in range(i + 1):
-                H[i, j] += Ji * J[j]
+        g[i] = _product(J[i, :n], residual)
+        for j in range(i + 1):
+            H[i, j] = _product(J[i, :n], J[j, :n])
+    total = _product(residual, residual)
 
     # Blur: log-normal.
     w = variance / _LOG_BLUR**2
+    s = x[5]
     e = log(s * radius / _BLUR_PX)
     total += w * e * e
     H[5, 5] += w / (s * s)
@@ -322,14 +346,14 @@ def _set_levels(pixels: np.ndarray, n: int, x: np.ndarray) -> bool:
     """Starts the levels of surround and step from the pixels clear of the edge; False where there are none."""
     around, inside, n_around, n_inside = 0.0, 0.0, 0, 0
     for i in range(n):
-        y0 = x[2] * pixels[i, 0] + x[3] * pixels[i, 1]
-        y1 = x[4] * pixels[i, 1]
+        y0 = x[2] * pixels[0, i] + x[3] * pixels[1, i]
+        y1 = x[4] * pixels[1, i]
         q2 = y0 * y0 + y1 * y1
         if q2 < 0.8:
-            inside += pixels[i, 2]
+            inside += pixels[2, i]
             n_inside += 1
         elif q2 > 1.2:
-            around += pixels[i, 2]
+            around += pixels[2, i]
             n_around += 1
     if n_inside == 0 or n_around == 0:
         return False
@@ -348,16 +372,17 @@ def _descend(
     sign: float,
     max_residual: float,
     enough_px: float,
+    J: np.ndarray,
     H: np.ndarray,
 ) -> float:
     """Levenberg-Marquardt from x, in place, until the centre moves less than ``enough_px``.
 
-    Returns the variance of the residuals (grey values²) and leaves JᵀJ in H; NaN where it leads nowhere.
+    Returns the variance of the residuals (grey values²) and leaves JᵀJ in H (J is storage); NaN where it leads nowhere.
     """
     H_new, L, g, g_new = np.empty((_N, _N)), np.zeros((_N, _N)), np.empty(_N), np.empty(_N)
     dx, x_new = np.empty(_N), np.empty(_N)
     damping, accepted = 1e-3, 0
-    cost = _normal_equations(pixels, n, x, radius, variance, H, g)
+    cost = _normal_equations(pixels, n, x, radius, variance, J, H, g)
     for _ in range(25):
         if not _solve(H, g, damping, L, dx):
             return np.nan
@@ -367,7 +392,7 @@ def _descend(
         is_sane = x_new[2] > 0.1 and x_new[4] > 0.1 and x_new[0] ** 2 + x_new[1] ** 2 < 1 and sign * x_new[9] > 0
         cost_new = cost
         if is_sane:
-            cost_new = _normal_equations(pixels, n, x_new, radius, variance, H_new, g_new)
+            cost_new = _normal_equations(pixels, n, x_new, radius, variance, J, H_new, g_new)
         # The Jacobian holds to first order in the distance, so its fixed point lies a little beside the least sum: a
         # small rise is no reason to turn back.
         if not is_sane or cost_new > 1.02 * cost:
@@ -389,7 +414,7 @@ def _descend(
 
 @njit(cache=True, nogil=True)
 def fit_ellipses(
-    image: Float[np.ndarray, "h w"],
+    image: Grey,
     start: Float[np.ndarray, "m 5"],
     coarseness_px: Float[np.ndarray, "m"],
     sign: float,
@@ -405,7 +430,7 @@ def fit_ellipses(
     """
     out = np.full((len(start), 12), np.nan)
     H, L, x = np.empty((_N, _N)), np.zeros((_N, _N)), np.empty(_N)
-    pixels = np.empty((1024, 3))
+    pixels, J = np.empty((3, 1024)), np.empty((_N + 1, 1024))
     for k in range(len(start)):
         u0, v0 = start[k, 0], start[k, 1]
         # A uniform ellipse with form E has second moments E/4; A is the factor of E⁻¹ = AᵀA, in radii.
@@ -416,14 +441,15 @@ def fit_ellipses(
         x[3] = -uv / (radius * radius) / x[2]
         x[4] = sqrt(uu / (radius * radius) - x[3] * x[3])
         x[5] = _BLUR_PX / radius
-        variance, needed = np.nan, 3.0 + coarseness_px[k]
+        reach = 3.0 + 0.1 * radius  # enough surround to tell light that changes from an edge that moves
+        variance, needed = np.nan, reach + coarseness_px[k]
         # A rough pass tells the noise, against which the prior is weighed, and where the edge lies; a second is final
         # unless the edge reaches beyond its window.
         for attempt in range(3):
             margin = needed
             room = int((2 * (sqrt(max(uu, vv)) + margin) + 6) ** 2)
-            if room > len(pixels):
-                pixels = np.empty((room, 3))
+            if room > pixels.shape[1]:
+                pixels, J = np.empty((3, room)), np.empty((_N + 1, room))
             inner = (margin + 2) / radius if radius > _SOLID_RADIUS_PX else np.inf
             n = _gather(image, u0, v0, radius, x, margin / radius, inner, pixels)
             if attempt == 0:
@@ -433,12 +459,12 @@ def fit_ellipses(
                 if sign * x[9] < 0.5 * min_contrast * max(x[6], x[6] + x[9]):
                     break
                 variance = max(1.0, 0.01 * x[9] * x[9])
-            enough_px = 0.1 if attempt == 0 else 5e-4
-            variance = _descend(pixels, n, x, radius, variance, sign, max_residual, enough_px, H)
+            enough_px = 0.1 if attempt == 0 else 2e-3
+            variance = _descend(pixels, n, x, radius, variance, sign, max_residual, enough_px, J, H)
             if not variance >= 0:
                 break
             variance = max(variance, _QUANTISATION_VARIANCE)
-            needed = 3.0 + 3.0 * max(0.0, x[5] * radius - 0.8)
+            needed = reach + 3.0 * max(0.0, x[5] * radius - 0.8)
             if attempt > 0 and needed < margin + 1:
                 break
         if not variance >= 0 or not _factor(H, 0.0, L):
@@ -467,6 +493,7 @@ def fit_ellipses(
 def warm_up() -> None:
     """Compiles every kernel of this module for the types with which the stage calls it."""
     v, u = np.mgrid[0:24, 0:24]
-    image = np.where((u - 12) ** 2 + (v - 12) ** 2 < 20, 50.0, 200.0).astype(np.float32)
-    found = blobs(image, np.full_like(image, 128.0), -1.0, 3.0, 20.0, 0.3, 0.7)
-    fit_ellipses(image, found[:, :5].copy(), np.zeros(len(found)), -1.0, 0.2, 0.12)
+    for dtype in (np.uint8, np.uint16):
+        image = np.where((u - 12) ** 2 + (v - 12) ** 2 < 20, 50, 200).astype(dtype)
+        found = blobs(image, np.full_like(image, 50), np.full_like(image, 200), -1.0, 0.2, 3.0, 20.0, 0.3, 0.7)
+        fit_ellipses(image, found[:, :5].copy(), np.zeros(len(found)), -1.0, 0.2, 0.12)

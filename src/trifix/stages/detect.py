@@ -3,6 +3,7 @@
 Knows grey values and nothing else: no camera, no map, no earlier image.
 """
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Literal
 
@@ -10,14 +11,28 @@ import cv2
 import numpy as np
 from jaxtyping import Float
 
-from trifix.kernels.detection import blobs, fit_ellipses
+from trifix.kernels.detection import Grey, blobs, fit_ellipses
 from trifix.records import Dots, GreyOrColour
 
-_SIGN = {"dark": -1.0, "bright": 1.0}
-# A level of the pyramid answers for blobs from 6 to 14 of its own pixels across (the finest also for smaller ones);
+_SIGNS = (-1.0, 1.0)  # dark, bright
+# A level of the pyramid answers for blobs from 6.5 to 14 of its own pixels across (the finest also for smaller ones);
 # the limits overlap, since a dot may be measured a little larger or smaller from one level to the next.
-_LEVEL_MIN_PX, _LEVEL_MAX_PX, _WINDOW_PX = 6.0, 14.0, 25
+_LEVEL_MIN_PX, _LEVEL_MAX_PX, _WINDOW_PX = 6.5, 14.0, 25
 _MIN_FILL = 0.75
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Level:
+    """One level of the pyramid."""
+
+    grey: Grey
+    """The image."""
+    darkest: Grey
+    """Least grey value in the window about each pixel."""
+    brightest: Grey
+    """Largest grey value in the window about each pixel."""
+    size: int
+    """Side of its pixels (px of the image)."""
 
 
 @dataclass(frozen=True)
@@ -26,10 +41,10 @@ class DetectOptions:
 
     polarity: Literal["auto", "dark", "bright"] = "auto"
     """Dots darker or brighter than what surrounds them; auto takes what the image has more good ones of."""
-    min_diameter_px: float = 3.0
-    """Least diameter of a dot: twice the root of the product of its semi-axes (px)."""
+    min_diameter_px: float = 3.5
+    """Least length of a dot's long axis, which is the diameter that a tilted round target keeps (px)."""
     max_diameter_px: float = 250.0
-    """Largest diameter of a dot (px)."""
+    """Largest length of a dot's long axis (px)."""
     min_axis_ratio: float = 0.34
     """Least ratio of the short axis to the long one; a round target tilted by 70 degrees shows 0.34."""
     min_contrast: float = 0.2
@@ -44,32 +59,71 @@ def detect(image: GreyOrColour, options: DetectOptions) -> Dots:
     Blobs on the local threshold at every level of a pyramid; then least squares of a blurred ellipse to the grey
     values, which gives centre, axes and covariance and tells dots from clutter by what it leaves.
     """
-    grey = np.ascontiguousarray(cv2.cvtColor(image, cv2.COLOR_BGR2GRAY) if image.ndim == 3 else image, np.float32)
-    if options.polarity == "auto":
-        fits = max(
-            (_fits(grey, sign, options) for sign in _SIGN.values()),
-            key=lambda fits: _evidence(fits, options.max_residual),
-        )
-    else:
-        fits = _fits(grey, _SIGN[options.polarity], options)
+    grey = np.ascontiguousarray(cv2.cvtColor(image, cv2.COLOR_BGR2GRAY) if image.ndim == 3 else image)
+    levels = list(_pyramid(grey, options))
+    signs = _SIGNS if options.polarity == "auto" else (_SIGNS[options.polarity == "bright"],)
+    fits = max(
+        (_fits(grey, levels, sign, options) for sign in signs), key=lambda fits: _evidence(fits, options.max_residual)
+    )
     fits = fits[np.lexsort((fits[:, 0], fits[:, 1]))]
-    cov = fits[:, [2, 3, 3, 4]].reshape(-1, 2, 2)
     n = len(fits)
-    return Dots(fits[:, :2], cov, fits[:, 5:8], np.full(n, -1), np.arange(n))
+    return Dots(
+        uv_px=fits[:, :2].copy(),
+        cov_px2=fits[:, [2, 3, 3, 4]].reshape(n, 2, 2),
+        ellipse=fits[:, 5:8].copy(),
+        label=np.full(n, -1),
+        row=np.arange(n),
+    )
 
 
-def _fits(grey: Float[np.ndarray, "h w"], sign: float, options: DetectOptions) -> Float[np.ndarray, "n 12"]:
+def _pyramid(grey: Grey, options: DetectOptions) -> Iterator[_Level]:
+    """The image at halved sizes, as far as dots of the wanted size need them."""
+    window = cv2.getStructuringElement(cv2.MORPH_RECT, (_WINDOW_PX, _WINDOW_PX))
+    size = 1
+    while size == 1 or (_LEVEL_MIN_PX * size <= options.max_diameter_px and min(grey.shape) > _LEVEL_MIN_PX):
+        if _LEVEL_MAX_PX * size >= options.min_diameter_px:
+            yield _Level(grey, cv2.erode(grey, window), cv2.dilate(grey, window), size)
+        h, w = grey.shape
+        grey = cv2.resize(grey[: h - h % 2, : w - w % 2], (w // 2, h // 2), interpolation=cv2.INTER_AREA)
+        size *= 2
+
+
+def _candidates(
+    levels: list[_Level], sign: float, options: DetectOptions
+) -> tuple[Float[np.ndarray, "m 5"], Float[np.ndarray, "m"]]:
+    """Centre and second moments (px, px²) of elliptic blobs, and how far off they may be (px)."""
+    # The short axis of the smallest dot, less what a blob of few pixels may lose.
+    least_px = 0.7 * options.min_diameter_px * np.sqrt(options.min_axis_ratio)
+    start, coarseness = [], []
+    for level in levels:
+        found = blobs(
+            level.grey,
+            level.darkest,
+            level.brightest,
+            sign,
+            options.min_contrast,
+            max(least_px / level.size, 0.0 if level.size == 1 else _LEVEL_MIN_PX),
+            _LEVEL_MAX_PX,
+            0.9 * options.min_axis_ratio,
+            _MIN_FILL,
+        )[:, :5] * np.array([level.size] * 2 + [level.size**2] * 3)
+        found[:, :2] += (level.size - 1) / 2
+        start.append(found)
+        coarseness.append(np.full(len(found), (level.size - 1) / 2))
+    return np.concatenate(start), np.concatenate(coarseness)
+
+
+def _fits(grey: Grey, levels: list[_Level], sign: float, options: DetectOptions) -> Float[np.ndarray, "n 12"]:
     """Accepted fits of one polarity."""
-    start, coarseness = _candidates(grey, sign, options)
+    start, coarseness = _candidates(levels, sign, options)
     fits = fit_ellipses(grey, start, coarseness, sign, options.min_contrast, options.max_residual)
     fits = fits[np.isfinite(fits[:, 0])]
     u, v, a, b = fits[:, 0], fits[:, 1], fits[:, 5], fits[:, 6]
     around, step, residual = fits[:, 9], np.abs(fits[:, 10]), fits[:, 11]
     h, w = grey.shape
-    diameter = 2 * np.sqrt(a * b)
     good = (
-        (diameter >= options.min_diameter_px)
-        & (diameter <= options.max_diameter_px)
+        (2 * a >= options.min_diameter_px)
+        & (2 * a <= options.max_diameter_px)
         & (b >= options.min_axis_ratio * a)
         & (step >= options.min_contrast * np.maximum(around, around + sign * step))
         & (residual <= options.max_residual * step)
@@ -92,42 +146,6 @@ def _distinct(fits: Float[np.ndarray, "n 12"]) -> Float[np.ndarray, "k 12"]:
         if kept[k]:
             kept[k + 1 :] &= ~close[k, k + 1 :]
     return fits[kept]
-
-
-def _candidates(
-    grey: Float[np.ndarray, "h w"], sign: float, options: DetectOptions
-) -> tuple[Float[np.ndarray, "m 5"], Float[np.ndarray, "m"]]:
-    """Centre and second moments (px, px²) of elliptic blobs, and how far off they may be (px)."""
-    start, coarseness = [], []
-    level, size = grey, 1.0
-    while size == 1 or (_LEVEL_MIN_PX * size <= options.max_diameter_px and min(level.shape) > _LEVEL_MIN_PX):
-        if _LEVEL_MAX_PX * size >= options.min_diameter_px:
-            threshold = _threshold(level, sign, options.min_contrast)
-            least = max(0.7 * options.min_diameter_px / size, 0.0 if size == 1 else _LEVEL_MIN_PX)
-            found = blobs(
-                level,
-                threshold,
-                sign,
-                least,
-                _LEVEL_MAX_PX,
-                options.min_axis_ratio * 0.9,
-                _MIN_FILL,
-            )
-            start.append(found[:, :5] * [size, size, size**2, size**2, size**2])
-            start[-1][:, :2] += (size - 1) / 2
-            coarseness.append(np.full(len(found), 0.5 * (size - 1)))
-        h, w = level.shape
-        level = cv2.resize(level[: h - h % 2, : w - w % 2], (w // 2, h // 2), interpolation=cv2.INTER_AREA)
-        size *= 2
-    return np.concatenate(start), np.concatenate(coarseness)
-
-
-def _threshold(level: Float[np.ndarray, "h w"], sign: float, min_contrast: float) -> Float[np.ndarray, "h w"]:
-    """Midway between the darkest and the brightest pixel about (Bernsen 1986); out of reach where these are alike."""
-    window = cv2.getStructuringElement(cv2.MORPH_RECT, (_WINDOW_PX, _WINDOW_PX))
-    darkest, brightest = cv2.erode(level, window), cv2.dilate(level, window)
-    is_edged = brightest - darkest > min_contrast * brightest
-    return np.asarray(np.where(is_edged, 0.5 * (darkest + brightest), np.float32(sign * np.inf)), dtype=np.float32)
 
 
 def _evidence(fits: Float[np.ndarray, "n 12"], max_residual: float) -> float:
