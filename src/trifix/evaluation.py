@@ -208,11 +208,13 @@ def table(evaluation: Evaluation) -> list[tuple[str, str]]:
         ("rotation error, median · rms · worst", _figures(e.error_deg, "°")),
         ("drift in position, median · rms · worst", _figures(e.drift_mm, "mm")),
         ("drift in rotation, median · rms · worst", _figures(e.drift_deg, "°")),
-        ("absolute pose error, rms", f"{e.ape_rmse_mm:.3f} mm"),
+        ("absolute pose error, rms", "none" if math.isnan(e.ape_rmse_mm) else f"{e.ape_rmse_mm:.3f} mm"),
         ("sightings identified rightly", str(e.sightings)),
         (
             "squared pose error over its covariance, mean",
-            f"{e.consistency.mean:.2f} ({e.consistency.low:.2f} to {e.consistency.high:.2f} expected)",
+            f"{e.consistency.mean:.2f} ({e.consistency.low:.2f} to {e.consistency.high:.2f} expected)"
+            if e.consistency.poses
+            else "none",
         ),
         ("poses within their own 95 % limits", str(e.consistency.inside)),
         ("true targets in the map", str(e.targets)),
@@ -332,6 +334,8 @@ def _rms_distance(T: Pose, b: Float[np.ndarray, "n k 3"], a: Float[np.ndarray, "
 
 
 def _figures(spread: Spread, unit: str) -> str:
+    if math.isnan(spread.rmse):
+        return "none"
     return f"{spread.median:.3f} · {spread.rmse:.3f} · {spread.max:.3f} {unit}"
 
 
@@ -377,10 +381,10 @@ def evaluate(
     results = read_table(out / "frames.csv", {"frame": int, "status": str}, {"reason": str})
     is_positioned = results["status"] == "positioned"
     reasons = results.get("reason", np.full(len(is_positioned), "", dtype=object))
-    if is_map_given is None:
-        is_map_given = PositionedReason.defines_world.name not in reasons
     frame, _, estimated, cov = read_poses(out / "poses.csv")
     targets = read_map(out / "map.csv")
+    if is_map_given is None:
+        is_map_given = len(targets) > 0 and PositionedReason.defines_world.name not in reasons
     level = _level_of(out)
     known = read_truth(truth)
     source = _recording_beside(truth, level) if recording is None else read_recording(recording, level)
