@@ -23,6 +23,7 @@ from trifix.files.calibrations import write_rig
 from trifix.files.maps import write_map
 from trifix.files.recordings import write_dots, write_frames, write_points
 from trifix.files.trajectories import POSES_HEADER, poses_row, tum_row
+from trifix.files.truth import read_truth
 from trifix.geometry.alignment import align
 from trifix.geometry.camera import Camera, StereoRig
 from trifix.geometry.pose import Pose
@@ -485,3 +486,40 @@ def test_results_of_another_recording_are_refused(tmp_path: Path) -> None:
     (long.out / "summary.json").unlink()
     with pytest.raises(RecordingError, match="results folder"):
         evaluate(long.out, long.truth_folder)
+
+
+# --- on real recordings ----------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("level", ["points", "dots"])
+@pytest.mark.parametrize("name", ["chess_subset/seed_1", "dice_plate", "boofcv_dots"])
+def test_real_truth_is_right_and_a_shift_of_it_is_misidentified(
+    data: Path, tmp_path: Path, name: str, level: str
+) -> None:
+    truth = read_truth(data / name / "truth")
+    results = {}
+    for shift_mm in (0.0, 3.5):  # 3.5 mm: one cell of the dice plate
+        out = tmp_path / f"{shift_mm}"
+        out.mkdir()
+        poses, frames = [POSES_HEADER], ["frame,timestamp_ns,status,reason"]
+        for k, stamp, T in zip(
+            truth.frames.index.tolist(), truth.frames.timestamp_ns.tolist(), truth.frames.T_map_sensor, strict=True
+        ):
+            poses.append(poses_row(k, stamp, Pose(np.eye(3), np.array([shift_mm, 0, 0])) @ T, np.eye(6) * 1e-6))
+            frames.append(f"{k},{stamp},positioned,")
+        (out / "poses.csv").write_text("\n".join(poses) + "\n")
+        (out / "frames.csv").write_text("\n".join(frames) + "\n")
+        (out / "sightings.csv").write_text("frame,kind,row,target\n")
+        (out / "summary.json").write_text(json.dumps({"level": level}))
+        (out / "map.csv").write_text((data / name / "map_given.csv").read_text())
+        results[shift_mm] = evaluate(out, truth.path)
+    right, shifted = results.values()
+    assert right.is_map_given
+    assert right.unlabelled == 0
+    assert right.misidentified == ()
+    assert right.error_mm.max < 1e-5
+    assert right.targets.count == right.targets.of
+    assert right.target_mm.max < 0.01
+    assert right.of_sharing.of == right.frames
+    assert len(shifted.misidentified) > 0.7 * shifted.frames
+    assert abs(shifted.ape_rmse_mm - 3.5) < 1e-5
