@@ -37,7 +37,7 @@ from trifix.stages.orient import orient
 from trifix.stages.triangulate import triangulate
 from trifix.stages.update import found_map, update
 from trifix.stages.verify import verify
-from trifix.stages.weigh import NoiseScale, scale_points, weigh_matches, weigh_residuals
+from trifix.stages.weigh import NoiseScale, add_prior_noise, scale_points, weigh_matches, weigh_residuals
 
 
 class Positioner:
@@ -101,15 +101,15 @@ class Positioner:
         if isinstance(content, StereoImages):
             with clock("detect"):
                 find = partial(detect, options=options.detect)
-                content = StereoDots(*self._cameras.map(find, (content.left, content.right)))
+                left, right = self._cameras.map(find, (content.left, content.right))
+            content = StereoDots(add_prior_noise(left, options.noise), add_prior_noise(right, options.noise))
         match content:
             case StereoDots():
                 assert frame.rig is not None, "dots come with the rig that saw them"
                 with clock("match"):
                     matches = match(content, frame.rig, options.match, self.noise.scale)
-                    self.noise = weigh_matches(
-                        self.noise, matches, options.match.max_epipolar_sigmas, self._is_noise_stated, options.noise
-                    )
+                    if not self.noise.is_known:
+                        self._weigh(matches)
                 with clock("triangulate"):
                     points = triangulate(content, matches, frame.rig, self.noise.scale)
                 return content, matches, points
@@ -164,6 +164,8 @@ class Positioner:
             return none
         if matches is None:
             self.noise = weigh_residuals(self.noise, points, self.map, fix, self._is_noise_stated, self.config.noise)
+        elif fix.reason is not PositionedReason.defines_world:
+            self._weigh(matches.rows(points.match[fix.point]))
         if self._is_map_frozen:
             self._identifier.learn(self.map, fix.target)
             return none
@@ -177,6 +179,13 @@ class Positioner:
             self._next_id += len(added)
             self._identifier.learn(self.map, np.unique(np.concatenate([fix.target, added])))
         return added
+
+    def _weigh(self, matches: StereoMatches) -> None:
+        """Epipolar residuals to the recording's noise: those of identified points, or all before anything is known."""
+        options = self.config
+        self.noise = weigh_matches(
+            self.noise, matches, options.match.max_epipolar_sigmas, self._is_noise_stated, options.noise
+        )
 
 
 class Stopwatch:

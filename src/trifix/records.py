@@ -119,6 +119,10 @@ class StereoMatches:
     def __len__(self) -> int:
         return len(self.left)
 
+    def rows(self, rows: Int[np.ndarray, "r"]) -> "StereoMatches":
+        """Some of the pairs."""
+        return StereoMatches(self.left[rows], self.right[rows], self.epipolar_px[rows], self.epipolar_sigma_px[rows])
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SensorPoints:

@@ -11,10 +11,10 @@ import numpy as np
 from jaxtyping import Float
 
 from trifix.errors import ConfigError
-from trifix.records import Fix, ReferenceMap, SensorPoints, StereoMatches
+from trifix.records import Dots, Fix, ReferenceMap, SensorPoints, StereoMatches
 
 _CHI2_3_MEDIAN = 2.366  # median of chi-square with three degrees of freedom
-_SCALES = np.geomspace(0.1, 10.0, 93)  # candidates, 5 % apart
+_SCALES = np.geomspace(0.02, 10.0, 128)  # candidates, 5 % apart
 
 
 @dataclass(frozen=True, slots=True)
@@ -23,7 +23,7 @@ class NoiseOptions:
 
     sigma_px: float = 0.3
     """Standard deviation of a dot's centre along each axis to start from, where the recording states none (px)."""
-    min_samples: int = 60
+    min_samples: int = 100
     """Residuals to await before the scale leaves 1."""
     max_samples: int = 4000
     """Residuals to remember; the oldest go first."""
@@ -54,11 +54,25 @@ class NoiseScale:
     seen: int = 0
     """Residuals seen altogether."""
 
+    @property
+    def is_known(self) -> bool:
+        """Whether the scale has been fitted at all."""
+        return self.fitted_at > 0
+
+
+def add_prior_noise(dots: Dots, options: NoiseOptions) -> Dots:
+    """Detected dots with the noise to start from on top of their own.
+
+    The image tells how well a dot's edge is seen. What calibration, synchronisation and a dot's own shape add, it
+    cannot tell: that is most of the error in practice, alike for all dots, and is learnt from the residuals.
+    """
+    return replace(dots, cov_px2=dots.cov_px2 + options.sigma_px**2 * np.eye(2))
+
 
 def weigh_matches(
     noise: NoiseScale, matches: StereoMatches, max_sigmas: float, is_stated: bool, options: NoiseOptions
 ) -> NoiseScale:
-    """The noise after the epipolar residuals of one frame, false pairs among them.
+    """The noise after the epipolar residuals of some pairs of dots, false ones among them.
 
     True pairs are normal and false ones uniform across the gate; the likelihood of that mixture is maximised over the
     scale and the share of true pairs.
@@ -139,7 +153,7 @@ def _fit_mixture(z: np.ndarray, gate: np.ndarray) -> float:
         share = 0.5
         for _ in range(8):  # expectation-maximisation of the share alone
             share = float(np.mean(share * normal / (share * normal + (1 - share) * uniform)))
-        value = float(np.log(share * normal + (1 - share) * uniform).sum())
+        value = float(np.log(share * normal + (1 - share) * uniform).sum()) - np.log(scale) ** 2
         if value > best_value:
             best, best_value = float(scale), value
     return best
