@@ -5,7 +5,6 @@ V := .venv
 UV := $(V)/bin/uv
 LOCKED = $(UV) pip compile -q pyproject.toml --all-extras --group dev --universal \
          --generate-hashes --no-emit-index-url --no-header --no-annotate
-export NO_COLOR ?= $(if $(CI),1)
 
 .PHONY: setup demo test check lock check-lock
 .DEFAULT_GOAL := test
@@ -26,6 +25,7 @@ $(V)/.stamp: requirements.lock pyproject.toml
 # The compiled loops are built once and kept; two test processes would otherwise build them twice.
 demo: setup
 	$(V)/bin/trifix warmup
+	rm -rf demo
 	$(V)/bin/trifix demo
 
 test: setup

@@ -12,7 +12,8 @@ ROOT = Path(__file__).resolve().parent.parent
 CHECKED = [
     f"trifix.{entry.stem}" for entry in (ROOT / "src" / "trifix").iterdir() if entry.stem not in ("kernels", "cli")
 ]
-jaxtyping.install_import_hook(CHECKED, "beartype.beartype")
+CHECKER = "beartype.beartype(conf=beartype.BeartypeConf(is_pep484_tower=True))"  # an int is a float, as for mypy
+jaxtyping.install_import_hook(CHECKED, CHECKER)
 
 
 @pytest.fixture(scope="session")

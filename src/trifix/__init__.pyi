@@ -1,13 +1,26 @@
-from trifix.config import Config
+from trifix.config import Config, read_config
 from trifix.errors import TrifixError
 from trifix.evaluation import evaluate
 from trifix.files.maps import read_map
-from trifix.files.recordings import Recording
-from trifix.geometry.camera import Camera
+from trifix.files.recordings import Recording, read_recording
+from trifix.geometry.camera import Camera, StereoRig
 from trifix.geometry.pose import Pose
 from trifix.outputs.report import Report
 from trifix.outputs.results import ResultsWriter
 from trifix.positioner import Positioner
+from trifix.records import (
+    Dots,
+    Fix,
+    Frame,
+    NoFix,
+    Reason,
+    ReferenceMap,
+    SensorPoints,
+    Step,
+    StereoDots,
+    StereoImages,
+    StereoMatches,
+)
 from trifix.sources.simulation import simulate
 from trifix.stages.detect import detect
 from trifix.stages.identify import identifier
@@ -20,18 +33,32 @@ from trifix.stages.verify import verify
 __all__ = [
     "Camera",
     "Config",
+    "Dots",
+    "Fix",
+    "Frame",
+    "NoFix",
     "Pose",
     "Positioner",
+    "Reason",
     "Recording",
+    "ReferenceMap",
     "Report",
     "ResultsWriter",
+    "SensorPoints",
+    "Step",
+    "StereoDots",
+    "StereoImages",
+    "StereoMatches",
+    "StereoRig",
     "TrifixError",
     "detect",
     "evaluate",
     "identifier",
     "match",
     "orient",
+    "read_config",
     "read_map",
+    "read_recording",
     "simulate",
     "triangulate",
     "update",

@@ -7,12 +7,14 @@ sentence on stderr. Exit codes: 0 complete, 1 bad input, 2 usage, 130 interrupte
 import os
 import signal
 import sys
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Annotated, Literal
 
 from cyclopts import App, CycloptsError, Parameter
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, ProgressColumn, Task, TextColumn, TimeRemainingColumn
+from rich.table import Table
 from rich.text import Text
 
 import trifix
@@ -89,14 +91,13 @@ def simulate(scene: str, /, *, out: Out, level: Level = "dots", seed: int = 0, f
     """Make a recording whose truth is known.
 
     Args:
-        scene: Name of the scene.
+        scene: Name of the scene; a wrong one lists them all.
         out: Folder for the recording and its truth.
         level: What to record.
         seed: Another seed makes another recording of the same scene.
         frames: Number of frames; without it, the scene's own.
     """
-    with _progress() as progress:
-        trifix.simulate(scene, out, level, seed, frames, progress)
+    _simulate(scene, out, level, seed, frames)
 
 
 @app.command(sort_key=2)
@@ -106,8 +107,8 @@ def demo(*, out: Out = Path("demo")) -> None:
     Args:
         out: Folder for everything.
     """
-    with _progress() as progress:
-        trifix.simulate("demo", out, "images", 0, None, progress)
+    if not (out / "truth").is_dir():  # written last: an earlier demo's recording is whole, and would be the same
+        _simulate("demo", out, "images")
     _position(trifix.read_recording(out / "recording"), out / "results", trifix.Config())
 
 
@@ -119,7 +120,9 @@ def evaluate(results: Path, truth: Path, /) -> None:
         results: Folder that `trifix run` wrote.
         truth: Folder of the truth.
     """
-    print(trifix.evaluate(results, truth))
+    from trifix.evaluation import table
+
+    _print_rows(table(trifix.evaluate(results, truth)))
 
 
 @app.command(sort_key=4)
@@ -153,7 +156,7 @@ def main() -> None:
     """Run the command line and leave with its exit code."""
     signal.signal(signal.SIGTERM, signal.default_int_handler)  # as ctrl-C: finished results stay whole
     try:
-        app()
+        app(sys.argv[1:])
         sys.stdout.flush()
     except CycloptsError as error:
         _leave(str(error), 2)
@@ -192,6 +195,20 @@ def _options(
     return with_overrides(trifix.read_config(file) if file else trifix.Config(), given)
 
 
+def _simulate(scene: str, out: Path, level: Level, seed: int = 0, frames: int | None = None) -> None:
+    """Make a recording; the bar appears with its first frame, so that a refusal stands alone."""
+    progress = _progress()
+    task = progress.add_task("simulating")
+    with ExitStack() as bar:
+
+        def show(done: int, of: int) -> None:
+            if not progress.live.is_started:
+                bar.enter_context(progress)
+            progress.update(task, completed=done, total=of)
+
+        trifix.simulate(scene, out, level, seed, frames, show)
+
+
 def _position(
     recording: "trifix.Recording",
     out: Path,
@@ -202,13 +219,12 @@ def _position(
 ) -> None:
     """Judge every frame, write down what was found, and say what it amounts to."""
     from trifix.config import to_toml
-    from trifix.outputs.report import Report
-    from trifix.outputs.results import ResultsWriter
+    from trifix.outputs.terminal import summary_table
 
     positioner = trifix.Positioner(options, given, is_map_frozen, recording.is_noise_stated)
-    report = Report(recording)
+    report = trifix.Report()
     with (
-        ResultsWriter(out, recording.path.name, recording.level, to_toml(options), is_online) as results,
+        trifix.ResultsWriter(out, recording.path.name, recording.level, to_toml(options), is_online) as results,
         _progress() as progress,
     ):
         for step in progress.track(positioner.run(recording), len(recording), description="positioning"):
@@ -216,7 +232,14 @@ def _position(
             report.show(step)
         summary = results.finish()
     report.write(out / "report.html", summary)
-    Console().print(summary)
+    Console().print(summary_table(summary, out / "report.html"))
+
+
+def _print_rows(rows: list[tuple[str, str]]) -> None:
+    table = Table.grid(padding=(0, 3))
+    for row in rows:
+        table.add_row(*map(Text, row))
+    Console().print(table)
 
 
 class _Rate(ProgressColumn):
@@ -227,8 +250,7 @@ class _Rate(ProgressColumn):
         self._unit = unit
 
     def render(self, task: Task) -> Text:
-        speed = task.finished_speed or task.speed
-        return Text("" if speed is None else f"{speed:.1f} {self._unit}/s")
+        return Text(f"{task.completed / task.elapsed:.1f} {self._unit}/s" if task.elapsed else "")
 
 
 def _progress(unit: str = "frames") -> Progress:
