@@ -69,7 +69,7 @@ def step(k: int, level: str, rng: np.random.Generator, world: ReferenceMap) -> S
     sensor, T = rig(), pose(k)
     seen = T.inverse().apply(world.xyz_mm)
     in_right = sensor.T_right_left.apply(seen)
-    visible = np.flatnonzero(sensor.left.sees(seen, 4) & sensor.right.sees(in_right, 4))
+    visible = np.flatnonzero(sensor.left.sees(seen, 4.0) & sensor.right.sees(in_right, 4.0))
     if k % 37 == 30:
         visible = visible[:2]
     n = len(visible)
@@ -140,11 +140,11 @@ def judged(
 
 def image(dots: Dots, rng: np.random.Generator) -> np.ndarray:
     """Bright discs on a dim background, 8 bit."""
+    vv, uu = np.mgrid[0:480, 0:640]
     canvas = np.linspace(40, 90, 640)[None] + rng.normal(0, 4, (480, 640))
     for u, v in dots.uv_px:
         u0, v0 = int(u), int(v)
         rows, columns = slice(max(v0 - 6, 0), v0 + 7), slice(max(u0 - 6, 0), u0 + 7)
-        vv, uu = np.mgrid[0:480, 0:640]
         distance = np.hypot(uu[rows, columns] - u, vv[rows, columns] - v)
         canvas[rows, columns] += 140 * np.clip(4 - distance, 0, 1)
     return canvas.clip(0, 255).astype(np.uint8)

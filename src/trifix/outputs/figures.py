@@ -1,6 +1,7 @@
 """The report's two figures, as SVG that takes its colours from the page. Draws arrays; knows no Step and no file."""
 
 import io
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -15,8 +16,8 @@ from matplotlib.ticker import MaxNLocator
 from trifix.records import ReferenceMap, TargetState
 
 # Drawn in these colours, which occur nowhere else, and then replaced by the page's variables.
-INK, FAINT, GRID, GOOD, BAD, SOFT, PATH = (f"#0102{k:02x}" for k in range(1, 8))
-_VARIABLES = {INK: "ink", FAINT: "faint", GRID: "grid", GOOD: "good", BAD: "bad", SOFT: "soft", PATH: "path"}
+INK, FAINT, GRID, GOOD, BAD, PATH = (f"#0102{k:02x}" for k in range(1, 7))
+_VARIABLES = {INK: "ink", FAINT: "faint", GRID: "grid", GOOD: "good", BAD: "bad", PATH: "path"}
 
 _STYLE = {
     "svg.fonttype": "none",  # text stays text
@@ -45,7 +46,7 @@ _STYLE = {
 }
 
 _MOST_BINS = 600  # more cannot be told apart on a page
-_MOST_VERTICES = 4000
+_MOST_VERTICES = 2000
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -96,7 +97,7 @@ def time_figure(course: Course) -> str:
         points.xaxis.set_major_locator(MaxNLocator(10, integer=True))
         points.margins(x=0.01)
         points.legend(loc="lower right", bbox_to_anchor=(1, 1), ncols=2, borderaxespad=0, labelcolor=INK)
-        return _svg(figure, "Outcome, residual and points of every frame")
+        return _svg(figure)
 
 
 def path_figure(course: Course, targets: ReferenceMap) -> str:
@@ -116,7 +117,7 @@ def path_figure(course: Course, targets: ReferenceMap) -> str:
         front.invert_yaxis()  # y points down
         handles, labels = front.get_legend_handles_labels()
         figure.legend(handles, labels, loc="outside lower center", ncols=max(len(labels), 1), labelcolor=INK)
-        return _svg(figure, "Targets and path of the sensor from the front and from above")
+        return _svg(figure)
 
 
 def _draw_outcome(axes: Axes, course: Course, lanes: Sequence[str]) -> None:
@@ -133,38 +134,43 @@ def _draw_outcome(axes: Axes, course: Course, lanes: Sequence[str]) -> None:
 
 
 def _runs(course: Course, is_meant: Bool[np.ndarray, "n"]) -> list[tuple[float, float]]:
-    """Start and width of each run of consecutive frames that are meant; none too thin to be seen."""
-    change = np.flatnonzero(np.diff(np.r_[False, is_meant, False].astype(int)))
-    thinnest = (course.frame[-1] - course.frame[0] + 1) / _MOST_BINS
-    return [
-        (course.frame[start] - 0.5, max(course.frame[end - 1] - course.frame[start] + 1, thinnest))
-        for start, end in change.reshape(-1, 2)
-    ]
+    """Start and width of each run of consecutive bins in which some frame is meant."""
+    bins = _binned(is_meant.astype(float))
+    meant = np.nanmax(bins, axis=1) > 0
+    edge = np.flatnonzero(np.diff(np.r_[False, meant, False].astype(int)))
+    first, end = edge[::2] * bins.shape[1], np.minimum(edge[1::2] * bins.shape[1], len(is_meant))
+    start, stop = course.frame[first] - 0.5, course.frame[end - 1] + 0.5
+    return list(zip(start.tolist(), (stop - start).tolist(), strict=True))
 
 
 def _draw_band(
     axes: Axes, frame: Int[np.ndarray, "n"], value: Float[np.ndarray, "n"], colour: str, label: str = ""
 ) -> None:
     """A value over time; of many frames, the median of each bin and the range around it."""
-    size = -(-len(frame) // _MOST_BINS)
-    padded = np.full(-(-len(frame) // size) * size, np.nan)
-    padded[: len(value)] = value
-    bins = padded.reshape(-1, size)
+    bins = _binned(value)
     known = np.isfinite(bins).any(axis=1)
     low, middle, high = np.full((3, len(bins)), np.nan)
     low[known], high[known] = np.nanmin(bins[known], axis=1), np.nanmax(bins[known], axis=1)
     middle[known] = np.nanmedian(bins[known], axis=1)
-    at = frame[::size].astype(float)
-    if size > 1:
+    at = frame[:: bins.shape[1]].astype(float)
+    if bins.shape[1] > 1:
         axes.fill_between(at, low, high, color=colour, alpha=0.25, linewidth=0)
     axes.plot(*_with_lone_points(at, middle), color=colour, linewidth=1.3, label=label)
+
+
+def _binned(value: Float[np.ndarray, "n"]) -> Float[np.ndarray, "bins size"]:
+    """Consecutive values in at most ``_MOST_BINS`` rows, the last one filled up with NaN."""
+    size = -(-len(value) // _MOST_BINS)
+    bins = np.full((-(-len(value) // size), size), np.nan)
+    bins.flat[: len(value)] = value
+    return bins
 
 
 def _draw_targets(axes: Axes, targets: ReferenceMap, row: int) -> None:
     looks: tuple[tuple[TargetState, str, dict[str, object]], ...] = (
         (TargetState.provisional, "target, provisional", {"marker": "o", "mfc": "none", "mec": FAINT, "ms": 3.5}),
         (TargetState.trusted, "target", {"marker": "o", "mfc": GOOD, "mec": "none", "ms": 4.5}),
-        (TargetState.quarantined, "target, quarantined", {"marker": "x", "mec": BAD, "ms": 5}),
+        (TargetState.quarantined, "target, quarantined", {"marker": "x", "mfc": "none", "mec": BAD, "ms": 5}),
     )
     for state, label, look in looks:
         xyz = targets.xyz_mm[targets.state == state]
@@ -195,14 +201,16 @@ def _draw_path(axes: Axes, course: Course, row: int) -> None:
 
 
 def _what_matters(course: Course, targets: ReferenceMap) -> tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3"]]:
-    """Centre and half extent of the box that holds the trusted targets and the path, with a margin.
+    """Centre and half extent of the box that holds the path and the trusted targets, if there are any; with a margin.
 
-    A false point far away must not shrink everything else.
+    A false target far away must not shrink everything else.
     """
-    trusted = targets.xyz_mm[targets.state == TargetState.trusted]
-    xyz = np.concatenate([trusted, course.position_mm[course.is_positioned], np.zeros((1, 3))])
-    if len(xyz) > 1:
-        xyz = xyz[:-1]
+    is_shown = targets.state == TargetState.trusted
+    if not is_shown.any():
+        is_shown = targets.alive
+    xyz = np.concatenate([targets.xyz_mm[is_shown], course.position_mm[course.is_positioned]])
+    if not len(xyz):
+        return np.zeros(3), np.full(3, 10.0)
     low, high = xyz.min(axis=0), xyz.max(axis=0)
     return (low + high) / 2, (high - low) * 0.55 + 10.0
 
@@ -218,13 +226,12 @@ def _with_lone_points(
     return x[row] + 1e-3 * is_double, y[row]
 
 
-def _svg(figure: Figure, title: str) -> str:
-    """The figure as an SVG element whose colours are the page's variables."""
+def _svg(figure: Figure) -> str:
+    """The figure as an SVG element whose colours are the page's variables, without a style sheet of its own."""
     text = io.StringIO()
     FigureCanvasSVG(figure)
-    figure.savefig(text, format="svg", transparent=True, metadata={"Date": None, "Creator": None, "Title": title})
-    svg = text.getvalue()
-    svg = svg[svg.index("<svg") :]
+    figure.savefig(text, format="svg", transparent=True, metadata=dict.fromkeys(("Date", "Creator", "Format", "Type")))
+    svg = re.sub(r"^.*?(?=<svg)|<defs>\s*<style.*?</defs>|font-family: [^;]*; ?", "", text.getvalue(), flags=re.DOTALL)
     for colour, name in _VARIABLES.items():
         svg = svg.replace(colour, f"var(--{name})")
     return svg

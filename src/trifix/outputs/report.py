@@ -93,6 +93,12 @@ def _environment() -> Environment:
         lstrip_blocks=True,
     )
     environment.filters["words"] = lambda name: name.replace("_", " ")
-    environment.filters["thousands"] = lambda count: f"{count:,}".replace(",", "\u202f")
-    environment.filters["number"] = lambda value, digits=3: "–" if value is None else f"{value:.{digits}g}"
+    environment.filters["thousands"] = _thousands
+    environment.filters["number"] = lambda value: (
+        "–" if value is None else _thousands(value) if value >= 1000 else f"{value:.3g}"
+    )
     return environment
+
+
+def _thousands(count: int | float) -> str:
+    return f"{count:,.0f}".replace(",", "\u202f")

@@ -11,7 +11,6 @@ import time
 from itertools import chain
 from pathlib import Path
 from types import TracebackType
-from typing import Self
 
 import msgspec
 import numpy as np
@@ -23,15 +22,13 @@ from trifix.files.recordings import DOTS_HEADER, Level, dots_rows
 from trifix.files.tables import fixed, significant, write_atomically
 from trifix.files.trajectories import POSES_HEADER, poses_row, tum_row
 from trifix.geometry.camera import Camera
-from trifix.outputs.summary import Summary, Tally
+from trifix.outputs.summary import STAGES, Summary, Tally
 from trifix.records import Fix, NoFix, Reason, ReferenceMap, Step
 
 FLUSH_S = 0.25
 """Longest wait of a row in memory (s)."""
 CHECKPOINT_S = 5.0
 """Longest wait of a changed map in memory (s)."""
-STAGES = ("detect", "match", "triangulate", "identify", "orient", "verify", "update")
-"""Columns of timings.csv, in the order of the work."""
 
 _POSE = "x_mm,y_mm,z_mm,qx,qy,qz,qw"
 # In the order in which they are written.
@@ -45,7 +42,6 @@ _HEADERS = {
     "trajectory.tum": "",
     "frames.csv": "frame,timestamp_ns,status,reason,dots_left,dots_right,points,matched,residual_mm,p_chance,detail",
 }
-_REPLACED = ("map.csv", "map.ply", "report.html")
 
 
 class ResultsWriter:
@@ -72,16 +68,18 @@ class ResultsWriter:
         self._closing = threading.Event()
         self._thread = threading.Thread(target=self._keep_writing, name="results", daemon=True)
 
-    def __enter__(self) -> Self:
+    def __enter__(self) -> "ResultsWriter":
         """Make the folder, or empty it of an earlier run's results.
 
         Raises:
             RecordingError: the folder holds something else, or cannot be written.
         """
         try:
-            _clear(self._out)
+            _make_folder(self._out)
             self._start = time.monotonic()
-            self._write_state()
+            self._write_state()  # first of all: from here on the summary says that the run is not finished
+            for name in (*_HEADERS, "report.html"):
+                (self._out / name).unlink(missing_ok=True)
             self._logs = {
                 name: _Log(self._out / name, header)
                 for name, header in _HEADERS.items()
@@ -234,8 +232,8 @@ class _Log:
         self._file.close()
 
 
-def _clear(out: Path) -> None:
-    """An existing folder without an earlier run's results, or a new one.
+def _make_folder(out: Path) -> None:
+    """Make the folder, unless it is there already and empty, or holds results.
 
     Raises:
         RecordingError: it is no folder, or holds files of somebody else.
@@ -245,9 +243,6 @@ def _clear(out: Path) -> None:
     out.mkdir(parents=True, exist_ok=True)
     if any(out.iterdir()) and not _is_result(out):
         raise RecordingError(f"{out} holds files that are not results of trifix: name a new or an empty folder.")
-    for folder in (out, *out.glob("islands/*")):
-        for name in (*_HEADERS, *_REPLACED):
-            (folder / name).unlink(missing_ok=True)
 
 
 def _is_result(out: Path) -> bool:
@@ -298,7 +293,7 @@ def _rival_rows(step: Step) -> list[str]:
 def _timing_row(step: Step) -> str:
     ms = step.timings_ms
     stages = ",".join(fixed(ms[stage], 3) if stage in ms else "" for stage in STAGES)
-    return f"{step.frame.index},{stages},{fixed(sum(ms.values()), 3)}"
+    return f"{step.frame.index},{stages},{fixed(sum(ms.values(), start=0.0), 3)}"
 
 
 def _distance_px(

@@ -45,6 +45,8 @@ class Sample:
     """Its number."""
     verdict: str
     """What came of it, in words."""
+    detail: str
+    """More about that."""
     is_positioned: bool
     """Whether it has a pose."""
     pictures: tuple[Picture, ...]
@@ -108,12 +110,11 @@ def sample(step: Step, step_index: int) -> Sample:
         case Fix() as fix:
             verdict = f"{len(fix.point)} identified, rms {fix.rms_mm:.3f} mm"
             if fix.reason is not None:
-                verdict += f" ({fix.reason.name.replace('_', ' ')})"
+                verdict += f", {fix.reason.name.replace('_', ' ')}"
         case NoFix() as refusal:
             verdict = f"refused: {refusal.why.name.replace('_', ' ')}"
-            if refusal.detail:
-                verdict += f" ({refusal.detail})"
-    return Sample(step_index, step.frame.index, verdict, isinstance(step.fix, Fix), _pictures(step))
+    is_positioned = isinstance(step.fix, Fix)
+    return Sample(step_index, step.frame.index, verdict, step.fix.detail, is_positioned, _pictures(step))
 
 
 def _pictures(step: Step) -> tuple[Picture, ...]:

@@ -12,6 +12,9 @@ from jaxtyping import Float
 
 from trifix.records import Fix, NoFix, ReferenceMap, Step, TargetState
 
+STAGES = ("detect", "match", "triangulate", "identify", "orient", "verify", "update")
+"""What is timed, in the order of the work."""
+
 
 @dataclass(frozen=True, slots=True)
 class Residuals:
@@ -88,7 +91,7 @@ class Tally:
         self._frames = self._positioned = 0
         self._reasons: Counter[str] = Counter()
         self._mm, self._px = _Spread(), _Spread()
-        self._timings_ms: dict[str, array[float]] = {}
+        self._timings_ms = {name: array("d") for name in (*STAGES, "total")}
         self._noise_scale = 1.0
 
     def add(self, step: Step, residual_px: Float[np.ndarray, "d"]) -> None:
@@ -104,13 +107,11 @@ class Tally:
             case NoFix() as refusal:
                 self._reasons[refusal.why.name] += 1
         for stage, ms in (*step.timings_ms.items(), ("total", sum(step.timings_ms.values()))):
-            self._timings_ms.setdefault(stage, array("d")).append(ms)
+            self._timings_ms[stage].append(ms)
         self._noise_scale = step.noise_scale
 
     def summary(self, targets: ReferenceMap, seconds: float, finished: bool) -> Summary:
         """The numbers so far, with the map as it now is."""
-        total = self._timings_ms.get("total", array("d"))
-        stages = {name: ms for name, ms in self._timings_ms.items() if name != "total"} | {"total": total}
         return Summary(
             recording=self._recording,
             level=self._level,
@@ -129,7 +130,7 @@ class Tally:
             noise_scale=self._noise_scale,
             timings={
                 name: Timing(float(np.median(ms)), float(np.percentile(ms, 99)), len(ms))
-                for name, ms in stages.items()
+                for name, ms in self._timings_ms.items()
                 if ms
             },
             seconds=seconds,
