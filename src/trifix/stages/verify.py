@@ -94,10 +94,11 @@ def verify(
     """
     if len(identification) == 0:
         return NoFix(Reason.no_candidate)
-    solutions = solve(points, map, identification, orientations, matches, options)
+    density = target_density(map.xyz_mm, np.flatnonzero(map.alive))
+    solutions = solve(points, map, identification, orientations, matches, density, options)
     if not solutions:
         return NoFix(Reason.no_candidate, "Every hypothesis looks at targets from behind or has its points on a line.")
-    return judge(solutions, points, map, tried or len(identification), options)
+    return judge(solutions, points, map, density, tried or len(identification), options)
 
 
 def solve(
@@ -106,13 +107,13 @@ def solve(
     identification: Identification,
     orientations: Orientations,
     matches: StereoMatches | None,
+    density: Float[np.ndarray, "k"],
     options: VerifyOptions,
 ) -> list[Solution]:
     """The different solutions that the hypotheses lead to, best first."""
     n = len(points)
     left, right = _dots_of(points, matches)
     alive = np.flatnonzero(map.alive)
-    density = target_density(map.xyz_mm, alive)
     sigma2 = np.trace(points.cov_mm2, axis1=1, axis2=2)
     target_sigma2 = np.trace(map.cov_mm2[alive], axis1=1, axis2=2)
     cell_mm = max(2.0 * options.gate_sigmas * float(np.sqrt(np.median(sigma2) + np.median(target_sigma2))), 1e-3)
@@ -184,6 +185,7 @@ def judge(
     solutions: list[Solution],
     points: SensorPoints,
     map: ReferenceMap,
+    density: Float[np.ndarray, "k"],
     tried: int,
     options: VerifyOptions,
 ) -> Fix | NoFix:
@@ -203,7 +205,7 @@ def judge(
             f"{len(best.point)} of {len(points)} points agree with the map to {rms_mm:.2f} mm; "
             f"by chance so in up to {p_chance:.1e} of such frames.",
         )
-    rivals = [s for s in solutions if s is best or _is_rival(best, s, points, options)]
+    rivals = [s for s in solutions if s is best or _is_rival(best, s, points, density, options)]
     if len(rivals) > 1:
         return refuse(
             Reason.ambiguous,
@@ -277,15 +279,26 @@ def _refined(
     return Solution(T, cov, point, target, log_ratio)
 
 
-def _is_rival(best: Solution, other: Solution, points: SensorPoints, options: VerifyOptions) -> bool:
-    """Whether another solution puts the points elsewhere and yet comes too near the best in explaining them."""
+def _is_rival(
+    best: Solution,
+    other: Solution,
+    points: SensorPoints,
+    density: Float[np.ndarray, "k"],
+    options: VerifyOptions,
+) -> bool:
+    """Whether another solution puts the points elsewhere and yet comes too near the best in explaining them.
+
+    Elsewhere is beyond the noise for one that is nearly as likely, and beyond half the way to the next target for one
+    that explains as many points: such is the mark of a pattern that repeats itself.
+    """
     p = best.point
     apart = (best.T_world_sensor.inverse() @ other.T_world_sensor).apply(points.xyz_mm[p]) - points.xyz_mm[p]
     d2 = np.einsum("ni,ni->n", apart, np.linalg.solve(points.cov_mm2[p], apart[:, :, None])[:, :, 0])
-    if np.median(d2) <= options.gate_sigmas**2:
-        return False  # the same pose, a little worse
-    near = other.log_ratio > best.log_ratio - np.log(options.min_rival_odds)
-    return bool(near or len(other.point) >= options.max_rival_share * len(best.point))
+    is_elsewhere = np.median(d2) > options.gate_sigmas**2
+    is_on_others = np.median(np.linalg.norm(apart, axis=1) * np.sqrt(density[best.target])) > 0.5
+    is_near = other.log_ratio > best.log_ratio - np.log(options.min_rival_odds)
+    explains_as_many = len(other.point) >= options.max_rival_share * len(best.point)
+    return bool((is_elsewhere and is_near) or (is_on_others and explains_as_many))
 
 
 def _is_part_of(point: Int[np.ndarray, "3"], target: Int[np.ndarray, "3"], solution: Solution) -> bool:
