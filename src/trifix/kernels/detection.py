@@ -41,9 +41,13 @@ def _root(parent: np.ndarray, i: int) -> int:
 
 
 @njit(cache=True, nogil=True)
-def _is_beyond(value: float, darkest: float, brightest: float, sign: float, min_contrast: float) -> bool:
-    lowest, highest = np.float32(darkest), np.float32(brightest)
-    return bool(highest - lowest > min_contrast * highest and sign * (2 * np.float32(value) - lowest - highest) > 0)
+def _is_beyond(
+    value: float, darkest: float, brightest: float, sign: float, min_contrast: float, min_range: float
+) -> bool:
+    lowest, highest = float(darkest), float(brightest)
+    return bool(
+        highest - lowest > max(min_contrast * highest, min_range) and sign * (2 * float(value) - lowest - highest) > 0
+    )
 
 
 @njit(cache=True, nogil=True)
@@ -53,6 +57,7 @@ def blobs(
     brightest: Grey,
     sign: float,
     min_contrast: float,
+    min_range: float,
     min_diameter_px: float,
     max_diameter_px: float,
     min_axis_ratio: float,
@@ -61,7 +66,9 @@ def blobs(
     """Blobs of pixels beyond the local threshold, 4-connected, away from the border, roughly elliptic.
 
     The threshold lies midway between the darkest and the brightest pixel about (Bernsen 1986), where these differ by
-    ``min_contrast`` of the brighter. ``sign`` is +1 for bright blobs, -1 for dark ones.
+    ``min_contrast`` of the brighter and by ``min_range`` grey values, which noise alone must not reach. ``sign`` is +1
+    for bright blobs, -1 for dark ones.
+
     Labels runs of pixels rather than pixels (He, Chao & Suzuki 2008), so that moments come in closed form.
     """
     h, w = image.shape
@@ -76,11 +83,11 @@ def blobs(
         start = n
         u = 0
         while u < w:
-            if not _is_beyond(image[v, u], darkest[v, u], brightest[v, u], sign, min_contrast):
+            if not _is_beyond(image[v, u], darkest[v, u], brightest[v, u], sign, min_contrast, min_range):
                 u += 1
                 continue
             u0 = u
-            while u < w and _is_beyond(image[v, u], darkest[v, u], brightest[v, u], sign, min_contrast):
+            while u < w and _is_beyond(image[v, u], darkest[v, u], brightest[v, u], sign, min_contrast, min_range):
                 u += 1
             row[n], first[n], last[n], parent[n] = v, u0, u - 1, n
             n += 1
@@ -370,7 +377,8 @@ def _descend(
     radius: float,
     variance: float,
     sign: float,
-    max_residual: float,
+    max_misfit: float,
+    noise: float,
     enough_px: float,
     J: np.ndarray,
     H: np.ndarray,
@@ -407,7 +415,7 @@ def _descend(
         accepted += 1
         if move_px < enough_px:
             return cost / (n - _N)
-        if accepted == 3 and cost > n * (2 * max_residual * x[9]) ** 2:
+        if accepted == 3 and cost > 4 * n * (noise**2 + (max_misfit * x[9]) ** 2):
             return np.nan
     return np.nan
 
@@ -419,14 +427,16 @@ def fit_ellipses(
     coarseness_px: Float[np.ndarray, "m"],
     sign: float,
     min_contrast: float,
-    max_residual: float,
+    max_misfit: float,
+    noise: float,
 ) -> Float[np.ndarray, "m 12"]:
     """Least squares of a blurred ellipse to the grey values about each blob (see FIT_COLUMNS).
 
     ``start`` holds u, v, uu, uv, vv of the blobs; ``coarseness_px`` is how far off that may be. The covariance is
     that of least squares with the noise taken from the residuals: the Cramér-Rao bound where the model holds.
     A fit is given up as soon as it is clear that its step (as a fraction of the brighter side) will stay well below
-    ``min_contrast`` or its residual (as a fraction of the step) well above ``max_residual``.
+    ``min_contrast`` or its residual well above what ``noise`` (grey values) and ``max_misfit`` (a fraction of the
+    step) make together.
     """
     out = np.full((len(start), 12), np.nan)
     H, L, x = np.empty((_N, _N)), np.zeros((_N, _N)), np.empty(_N)
@@ -460,7 +470,7 @@ def fit_ellipses(
                     break
                 variance = max(1.0, 0.01 * x[9] * x[9])
             enough_px = 0.1 if attempt == 0 else 2e-3
-            variance = _descend(pixels, n, x, radius, variance, sign, max_residual, enough_px, J, H)
+            variance = _descend(pixels, n, x, radius, variance, sign, max_misfit, noise, enough_px, J, H)
             if not variance >= 0:
                 break
             variance = max(variance, _QUANTISATION_VARIANCE)
@@ -495,5 +505,5 @@ def warm_up() -> None:
     v, u = np.mgrid[0:24, 0:24]
     for dtype in (np.uint8, np.uint16):
         image = np.where((u - 12) ** 2 + (v - 12) ** 2 < 20, 50, 200).astype(dtype)
-        found = blobs(image, np.full_like(image, 50), np.full_like(image, 200), -1.0, 0.2, 3.0, 20.0, 0.3, 0.7)
-        fit_ellipses(image, found[:, :5].copy(), np.zeros(len(found)), -1.0, 0.2, 0.12)
+        found = blobs(image, np.full_like(image, 50), np.full_like(image, 200), -1.0, 0.2, 0.0, 3.0, 20.0, 0.3, 0.7)
+        fit_ellipses(image, found[:, :5].copy(), np.zeros(len(found)), -1.0, 0.2, 0.12, 0.0)

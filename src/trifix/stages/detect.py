@@ -19,6 +19,7 @@ _SIGNS = (-1.0, 1.0)  # dark, bright
 # the limits overlap, since a dot may be measured a little larger or smaller from one level to the next.
 _LEVEL_MIN_PX, _LEVEL_MAX_PX, _WINDOW_PX = 6.5, 14.0, 25
 _MIN_FILL = 0.75
+_NOISE_RANGE = 9.0  # standard deviations that noise alone does not span within a window
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -49,8 +50,9 @@ class DetectOptions:
     """Least ratio of the short axis to the long one; a round target tilted by 70 degrees shows 0.34."""
     min_contrast: float = 0.2
     """Least step at the dot's edge, as a fraction of the brighter side."""
-    max_residual: float = 0.12
-    """Largest rms residual of the fitted ellipse, as a fraction of the step; lower refuses more clutter."""
+    max_misfit: float = 0.12
+    """Largest rms residual of the fitted ellipse beyond the image's noise, as a fraction of the step; less refuses more
+    clutter."""
 
 
 def detect(image: GreyOrColour, options: DetectOptions) -> Dots:
@@ -60,10 +62,11 @@ def detect(image: GreyOrColour, options: DetectOptions) -> Dots:
     values, which gives centre, axes and covariance and tells dots from clutter by what it leaves.
     """
     grey = np.ascontiguousarray(cv2.cvtColor(image, cv2.COLOR_BGR2GRAY) if image.ndim == 3 else image)
-    levels = list(_pyramid(grey, options))
+    levels, noise = list(_pyramid(grey, options)), _noise(grey)
     signs = _SIGNS if options.polarity == "auto" else (_SIGNS[options.polarity == "bright"],)
     fits = max(
-        (_fits(grey, levels, sign, options) for sign in signs), key=lambda fits: _evidence(fits, options.max_residual)
+        (_fits(grey, levels, noise, sign, options) for sign in signs),
+        key=lambda fits: _evidence(_misfit(fits, noise), options),
     )
     fits = fits[np.lexsort((fits[:, 0], fits[:, 1]))]
     n = len(fits)
@@ -81,20 +84,21 @@ def _pyramid(grey: Grey, options: DetectOptions) -> Iterator[_Level]:
     window = cv2.getStructuringElement(cv2.MORPH_RECT, (_WINDOW_PX, _WINDOW_PX))
     size = 1
     while size == 1 or (_LEVEL_MIN_PX * size <= options.max_diameter_px and min(grey.shape) > _LEVEL_MIN_PX):
+        if size > 1:
+            h, w = grey.shape
+            grey = cv2.resize(grey[: h - h % 2, : w - w % 2], (w // 2, h // 2), interpolation=cv2.INTER_AREA)
         if _LEVEL_MAX_PX * size >= options.min_diameter_px:
             yield _Level(grey, cv2.erode(grey, window), cv2.dilate(grey, window), size)
-        h, w = grey.shape
-        grey = cv2.resize(grey[: h - h % 2, : w - w % 2], (w // 2, h // 2), interpolation=cv2.INTER_AREA)
         size *= 2
 
 
 def _candidates(
-    levels: list[_Level], sign: float, options: DetectOptions
+    levels: list[_Level], noise: float, sign: float, options: DetectOptions
 ) -> tuple[Float[np.ndarray, "m 5"], Float[np.ndarray, "m"]]:
     """Centre and second moments (px, px²) of elliptic blobs, and how far off they may be (px)."""
     # The short axis of the smallest dot, less what a blob of few pixels may lose.
     least_px = 0.7 * options.min_diameter_px * np.sqrt(options.min_axis_ratio)
-    start, coarseness = [], []
+    start, coarseness = [np.zeros((0, 5))], [np.zeros(0)]
     for level in levels:
         found = blobs(
             level.grey,
@@ -102,6 +106,7 @@ def _candidates(
             level.brightest,
             sign,
             options.min_contrast,
+            _NOISE_RANGE * noise / level.size,
             max(least_px / level.size, 0.0 if level.size == 1 else _LEVEL_MIN_PX),
             _LEVEL_MAX_PX,
             0.9 * options.min_axis_ratio,
@@ -113,30 +118,37 @@ def _candidates(
     return np.concatenate(start), np.concatenate(coarseness)
 
 
-def _fits(grey: Grey, levels: list[_Level], sign: float, options: DetectOptions) -> Float[np.ndarray, "n 12"]:
+def _fits(
+    grey: Grey, levels: list[_Level], noise: float, sign: float, options: DetectOptions
+) -> Float[np.ndarray, "n 12"]:
     """Accepted fits of one polarity."""
-    start, coarseness = _candidates(levels, sign, options)
-    fits = fit_ellipses(grey, start, coarseness, sign, options.min_contrast, options.max_residual)
+    start, coarseness = _candidates(levels, noise, sign, options)
+    fits = fit_ellipses(grey, start, coarseness, sign, options.min_contrast, options.max_misfit, noise)
     fits = fits[np.isfinite(fits[:, 0])]
     u, v, a, b = fits[:, 0], fits[:, 1], fits[:, 5], fits[:, 6]
-    around, step, residual = fits[:, 9], np.abs(fits[:, 10]), fits[:, 11]
+    around, step = fits[:, 9], np.abs(fits[:, 10])
     h, w = grey.shape
     good = (
         (2 * a >= options.min_diameter_px)
         & (2 * a <= options.max_diameter_px)
         & (b >= options.min_axis_ratio * a)
         & (step >= options.min_contrast * np.maximum(around, around + sign * step))
-        & (residual <= options.max_residual * step)
+        & (_misfit(fits, noise) <= options.max_misfit)
         & (np.minimum(u, v) >= a)
         & (u + a <= w - 1)
         & (v + a <= h - 1)
     )
-    return _distinct(fits[good])
+    return _distinct(fits[good], noise)
 
 
-def _distinct(fits: Float[np.ndarray, "n 12"]) -> Float[np.ndarray, "k 12"]:
+def _misfit(fits: Float[np.ndarray, "n 12"], noise: float) -> Float[np.ndarray, "n"]:
+    """Residual beyond the noise, as a fraction of the step."""
+    return np.asarray(np.sqrt(np.maximum(fits[:, 11] ** 2 - noise**2, 0.0)) / np.abs(fits[:, 10]))
+
+
+def _distinct(fits: Float[np.ndarray, "n 12"], noise: float) -> Float[np.ndarray, "k 12"]:
     """The fits without the worse of any two whose centres lie within the short axis of one of them."""
-    order = np.argsort(fits[:, 11] / np.abs(fits[:, 10]), kind="stable")
+    order = np.argsort(_misfit(fits, noise), kind="stable")
     fits = fits[order]
     close = np.hypot(*(fits[:, None, :2] - fits[None, :, :2]).transpose(2, 0, 1)) < np.maximum(
         fits[:, None, 6], fits[None, :, 6]
@@ -148,10 +160,24 @@ def _distinct(fits: Float[np.ndarray, "n 12"]) -> Float[np.ndarray, "k 12"]:
     return fits[kept]
 
 
-def _evidence(fits: Float[np.ndarray, "n 12"], max_residual: float) -> float:
-    """How much a set of fits looks like targets: each counts by how far its residual stays below the limit.
+def _evidence(misfit: Float[np.ndarray, "n"], options: DetectOptions) -> float:
+    """How much a set of fits looks like targets: each counts by how far its misfit stays below the limit.
 
     Clutter that passes does so narrowly, a target leaves hardly more than noise; the square of the margin keeps many
     of the one from outvoting a few of the other.
     """
-    return float(np.sum((1 - fits[:, 11] / (max_residual * np.abs(fits[:, 10]))) ** 2))
+    return float(np.sum((1 - misfit / options.max_misfit) ** 2))
+
+
+def _noise(grey: Grey) -> float:
+    """Standard deviation of the image's noise (grey values).
+
+    Immerkær's difference of two Laplacians (1996), which is blind to slopes, on every eighth row; its median instead of
+    its mean is blind to edges too. Texture of a pixel's size counts as noise.
+    """
+    if min(grey.shape) < 3:
+        return 0.0
+    rows = [grey[i : len(grey) - 2 + i : 8].astype(np.float32) for i in range(3)]
+    across = rows[0] - 2 * rows[1] + rows[2]
+    mask = across[:, :-2] - 2 * across[:, 1:-1] + across[:, 2:]
+    return float(np.median(np.abs(mask))) / (0.6745 * 6)
