@@ -1,7 +1,7 @@
 """The command line: one short function a command, in the order of a working day.
 
-Numerics are imported inside the functions, so that help and usage errors come at once. What goes wrong is said in one
-sentence on stderr. Exit codes: 0 complete, 1 bad input, 2 usage, 130 interrupted.
+Numerics load when a function first asks for them, so that help and usage errors come at once. What goes wrong is said
+in one sentence on stderr. Exit codes: 0 complete, 1 bad input, 2 usage, 130 interrupted.
 """
 
 import os
@@ -23,7 +23,7 @@ from trifix.errors import TrifixError
 app = App(
     name="trifix",
     help="Where is the sensor? Verified poses of a hand-held stereo sensor from identical round targets.",
-    version=lambda: _version(),
+    version=lambda: f"trifix {trifix.__version__}",
     default_parameter=Parameter(negative=()),
     print_error=False,
     exit_on_error=False,
@@ -40,7 +40,7 @@ def _is_setting(_: object, settings: tuple[str, ...]) -> None:
 
 Level = Literal["images", "dots", "points"]
 Out = Annotated[Path, Parameter(name=["--out", "-o"])]
-Settings = Annotated[tuple[str, ...], Parameter(name="--set", validator=_is_setting)]
+Settings = Annotated[tuple[str, ...], Parameter(name="--set", validator=_is_setting, show_default=False)]
 
 
 @app.command(sort_key=0)
@@ -56,7 +56,6 @@ def run(
     polarity: Literal["auto", "dark", "bright"] | None = None,
     frame_triangles: Literal["auto", "all", "local"] | None = None,
     sigma_px: float | None = None,
-    target_diameter_mm: float | None = None,
     config: Path | None = None,
     settings: Settings = (),
 ) -> None:
@@ -71,11 +70,13 @@ def run(
         map_mode: Leave the given map as it is, or let it grow.
         polarity: Brightness of the targets against what surrounds them.
         frame_triangles: Look at all triangles of a frame, or at those between neighbours.
-        sigma_px: Standard deviation of a dot's centre to start from, where the recording states none (px).
-        target_diameter_mm: Diameter of the targets (mm), where it is known.
+        sigma_px: Standard deviation of a dot's centre to start from, where the recording states none (px); 0.3 unless
+            an option says otherwise.
         config: TOML file of options; `trifix config` prints one.
         settings: An option by its full name, such as match.max_depth_mm=900; may be repeated.
     """
+    if map_ is None and map_mode == "frozen":
+        raise CycloptsError(msg="--map-mode frozen keeps a given map as it is: name it with --map.")
     options = _options(
         config,
         settings,
@@ -166,7 +167,7 @@ def main() -> None:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # or the interpreter complains as it ends
         _leave("whoever read the output has gone, so not all of it was printed.", 1)
     except OSError as error:
-        _leave(f"{error.filename or 'a file'}: {error.strerror or error}.", 1)
+        _leave(f"{error.filename}: {error.strerror}." if error.filename else f"{error}.", 1)
     except KeyboardInterrupt:
         _leave("interrupted; what was finished until then is whole.", 130)
 
@@ -174,12 +175,6 @@ def main() -> None:
 def _leave(sentence: str, code: int) -> None:
     print(f"trifix: {sentence}", file=sys.stderr)
     sys.exit(code)
-
-
-def _version() -> str:
-    from importlib.metadata import version
-
-    return f"trifix {version('trifix')}"
 
 
 def _options(
