@@ -462,7 +462,7 @@ def _recording_beside(truth: Path, level: Level) -> Recording | None:
     """The recording of some level in the folder that holds the truth; None if there is none."""
     for name in (f"recording_{level}", "recording"):
         folder = truth.resolve().parent / name
-        if holds_images(folder) if level == "images" else (folder / f"{level}.csv").exists():
+        if folder.is_dir() and (holds_images(folder) if level == "images" else (folder / f"{level}.csv").exists()):
             return read_recording(folder, level)
     return None
 
