@@ -853,3 +853,36 @@ def nearest(xyz, k):
             out[p, i] = q
             held = min(held + 1, k)
     return out
+
+
+def warm_up() -> None:
+    """Compiles every kernel for the types that it meets in use."""
+    xyz = np.array(
+        [[0.0, 0.0, 400.0], [40.0, 0.0, 410.0], [0.0, 60.0, 420.0], [50.0, 70.0, 400.0], [90.0, 20.0, 430.0]]
+    )
+    cov = np.tile(np.eye(3) * 0.01, (len(xyz), 1, 1))
+    rows = np.arange(len(xyz))
+    none = np.full(len(xyz), -1)
+    view = np.tile([0.0, 0.0, -1.0], (len(xyz), 1))
+    density = np.full(len(xyz), 1e-3)
+    neighbours = nearest(xyz, 4)
+    described = describe_triangles(xyz, cov, -xyz, local_triangles(neighbours), 0.3)
+    longest_last = np.argsort(described[1][:, 2])
+    sorted_by_length = tuple(column[longest_last] for column in described)
+    points, targets, _, _ = match_triangles(*described, *sorted_by_length, 3.0, 0.0, 1000)
+    oriented = orient_triangles(xyz, cov, points, xyz, cov, targets)
+    grid = build_grid(xyz, rows, 10.0)
+    scene = (xyz, cov, none, none, xyz, cov, view, density)
+    score_hypotheses(*oriented, points, targets, neighbours, *scene, *grid, 10.0, 4.0)
+    R, t, P, _ = (column[0].copy() for column in oriented)
+    used = np.zeros(len(xyz) + 1, dtype=np.bool_)
+    log_ratio = np.zeros(len(CLUTTER_SHARES))
+    targets_with_free = (xyz, cov, view, density, used.copy())
+    grow(R, t, P, rows, xyz, cov, none, none, used, used, *targets_with_free, *grid, 10.0, 4.0, none.copy(), log_ratio)
+    log_mean(log_ratio)
+    head, best = np.full(len(xyz), -1), np.full((len(xyz), 3), -1)
+    following = np.append(np.arange(1, 40), -1)
+    edges = (head, np.zeros(40, dtype=np.int64), np.zeros(40, dtype=np.int64), np.zeros(40), following)
+    free, _ = count_pairs(rows, xyz, *edges, 0, best)
+    rarest_pairs(local_triangles(neighbours), *edges[:3], following)
+    forget_targets(np.zeros(len(xyz), dtype=np.bool_), *edges, free, best)
