@@ -185,6 +185,17 @@ def test_dots_are_found_among_clutter() -> None:
     assert len(dots) < 2 * len(distance)
 
 
+def test_the_edge_of_a_sticker_near_the_dot_does_not_spoil_the_covariance() -> None:
+    rng = np.random.default_rng(8)
+    scene = grid(rng, 16, 30, 0.7, 8)
+    sticker = render(scene.ellipses * [1, 1, 1.5, 1.5, 1], *scene.coverage.shape[::-1], 0.7).coverage
+    light = np.repeat(np.linspace(80, 160, sticker.shape[1])[None], len(sticker), axis=0)
+    image = light * (1 - sticker) + 30 * sticker + 170 * scene.coverage + 2 * rng.standard_normal(sticker.shape)
+    error, squares = normalised(detect(np.clip(np.rint(image), 0, 255).astype(np.uint8), BRIGHT), scene)
+    assert np.sqrt(np.mean(np.sum(error**2, axis=1))) < 0.02
+    assert 0.7 < squares.mean() / 2 < 1.4
+
+
 def test_auto_takes_the_polarity_of_the_dots(scene: Scene) -> None:
     image = expose(scene, 180, 30, 2, np.random.default_rng(0))
     dark, bright = detect(image, DetectOptions()), detect(255 - image, DetectOptions())

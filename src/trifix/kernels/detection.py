@@ -191,8 +191,8 @@ def _solve(H: np.ndarray, g: np.ndarray, damping: float, L: np.ndarray, x: np.nd
 
 
 @njit(cache=True, nogil=True)
-def _leading_inverse(L: np.ndarray) -> tuple[float, float, float]:
-    """Entries 00, 01, 11 of (LLᵀ)⁻¹: products of the first columns of L⁻¹."""
+def _leading_inverse(L: np.ndarray, unit: float) -> tuple[float, float, float]:
+    """Entries 00, 01, 11 of unit·(LLᵀ)⁻¹: products of the first columns of L⁻¹."""
     a, b = np.zeros(_N), np.zeros(_N)
     for i in range(_N):
         s, t = 1.0 if i == 0 else 0.0, 1.0 if i == 1 else 0.0
@@ -200,7 +200,7 @@ def _leading_inverse(L: np.ndarray) -> tuple[float, float, float]:
             s -= L[i, k] * a[k]
             t -= L[i, k] * b[k]
         a[i], b[i] = s / L[i, i], t / L[i, i]
-    return float(np.sum(a * a)), float(np.sum(a * b)), float(np.sum(b * b))
+    return unit * np.sum(a * a), unit * np.sum(a * b), unit * np.sum(b * b)
 
 
 @njit(cache=True, nogil=True)
@@ -439,7 +439,7 @@ def fit_ellipses(
     step) make together.
     """
     out = np.full((len(start), 12), np.nan)
-    H, L, x = np.empty((_N, _N)), np.zeros((_N, _N)), np.empty(_N)
+    H, L, x, narrow = np.empty((_N, _N)), np.zeros((_N, _N)), np.empty(_N), np.empty(_N)
     pixels, J = np.empty((3, 1024)), np.empty((_N + 1, 1024))
     for k in range(len(start)):
         u0, v0 = start[k, 0], start[k, 1]
@@ -479,8 +479,21 @@ def fit_ellipses(
                 break
         if not variance >= 0 or not _factor(H, 0.0, L):
             continue
-        c_uu, c_uv, c_vv = _leading_inverse(L)
-        unit = variance * radius * radius
+        c_uu, c_uv, c_vv = _leading_inverse(L, variance * radius * radius)
+        # More than noise remains: the surround may end near the edge (a sticker, a neighbour). Of the wide window and a
+        # narrow one, that with the smaller covariance is right.
+        if variance > 2 * max(noise * noise, _QUANTISATION_VARIANCE):
+            narrow[:] = x
+            margin = max(1.5, 0.25 * radius)
+            n = _gather(image, u0, v0, radius, narrow, margin / radius, inner, pixels)
+            if n > 2 * _N:
+                found = _descend(pixels, n, narrow, radius, variance, sign, max_misfit, noise, enough_px, J, H)
+                found = max(found, _QUANTISATION_VARIANCE) if found >= 0 else np.inf
+                if found < variance and _factor(H, 0.0, L):
+                    n_uu, n_uv, n_vv = _leading_inverse(L, found * radius * radius)
+                    if n_uu + n_vv < c_uu + c_vv:
+                        x[:], variance = narrow, found
+                        c_uu, c_uv, c_vv = n_uu, n_uv, n_vv
         # What sampling a sharp edge adds (px², each way): found to fall with the number of pixels along the edge, and
         # as the spectrum of the blur at the sampling frequency, exp(−2π²s²).
         blur_px = x[5] * radius
@@ -491,7 +504,7 @@ def fit_ellipses(
         spread = sqrt(0.25 * (e_uu - e_vv) ** 2 + e_uv * e_uv)
         mean = 0.5 * (e_uu + e_vv)
         out[k, 0], out[k, 1] = u0 + x[0] * radius, v0 + x[1] * radius
-        out[k, 2], out[k, 3], out[k, 4] = unit * c_uu + aliasing, unit * c_uv, unit * c_vv + aliasing
+        out[k, 2], out[k, 3], out[k, 4] = c_uu + aliasing, c_uv, c_vv + aliasing
         out[k, 5] = radius * sqrt(mean + spread)
         out[k, 6] = radius * sqrt(max(mean - spread, 0.0))
         out[k, 7] = 0.5 * atan2(2 * e_uv, e_uu - e_vv)
