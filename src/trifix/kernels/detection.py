@@ -11,11 +11,9 @@ from numba import njit
 
 Grey = UInt8[np.ndarray, "h w"] | UInt16[np.ndarray, "h w"]
 
-BLOB_COLUMNS = 6
-"""u, v, the second moments uu, uv, vv of the blob's area (px²), and its fill: area over that of the ellipse."""
-
-FIT_COLUMNS = 12
-"""u, v, their covariance uu, uv, vv, semi-axes a, b, angle, blur, level around, contrast, rms residual; NaN: no fit."""
+# Columns of a fit: centre and its covariance (px, px²), semi-axes (px) and the long one's angle (rad), blur of the edge
+# (px), grey values of the surround and of the step from it to the dot, rms residual. All NaN where there is no fit.
+U, V, COV_UU, COV_UV, COV_VV, A, B, THETA, BLUR, AROUND, STEP, RESIDUAL = range(12)
 
 # Parameters of the fit: centre (2), the triangular factor of the ellipse's form (3), blur, level and gradient of the
 # surround (3), level and gradient of the step (3).
@@ -62,12 +60,12 @@ def blobs(
     max_diameter_px: float,
     min_axis_ratio: float,
     min_fill: float,
-) -> Float[np.ndarray, "m 6"]:
-    """Blobs of pixels beyond the local threshold, 4-connected, away from the border, roughly elliptic.
+) -> Float[np.ndarray, "m 5"]:
+    """Centre u, v (px) and second moments uu, uv, vv (px²) of roughly elliptic blobs away from the border.
 
-    The threshold lies midway between the darkest and the brightest pixel about (Bernsen 1986), where these differ by
-    ``min_contrast`` of the brighter and by ``min_range`` grey values, which noise alone must not reach. ``sign`` is +1
-    for bright blobs, -1 for dark ones.
+    A blob is 4-connected pixels beyond the local threshold, which lies midway between the darkest and the brightest
+    pixel about (Bernsen 1986), where these differ by ``min_contrast`` of the brighter and by ``min_range`` grey values,
+    which noise alone must not reach. ``sign`` is +1 for bright blobs, -1 for dark ones.
 
     Labels runs of pixels rather than pixels (He, Chao & Suzuki 2008), so that moments come in closed form.
     """
@@ -129,7 +127,7 @@ def blobs(
 
     min_area_px2 = max(pi / 4 * min_diameter_px**2, 4.0)
     max_area_px2 = pi / 4 * max_diameter_px**2
-    out = np.empty((n, 6))
+    out = np.empty((n, 5))
     found = 0
     for k in range(n):
         area = sums[k, 0]
@@ -148,7 +146,7 @@ def blobs(
         if minor < min_axis_ratio * min_axis_ratio * major or fill < min_fill:
             continue
         out[found, 0], out[found, 1] = u_mean, v_mean
-        out[found, 2], out[found, 3], out[found, 4], out[found, 5] = uu, uv, vv, fill
+        out[found, 2], out[found, 3], out[found, 4] = uu, uv, vv
         found += 1
     return out[:found].copy()
 
@@ -430,7 +428,7 @@ def fit_ellipses(
     max_misfit: float,
     noise: float,
 ) -> Float[np.ndarray, "m 12"]:
-    """Least squares of a blurred ellipse to the grey values about each blob (see FIT_COLUMNS).
+    """Least squares of a blurred ellipse to the grey values about each blob.
 
     ``start`` holds u, v, uu, uv, vv of the blobs; ``coarseness_px`` is how far off that may be. The covariance is
     that of least squares with the noise taken from the residuals: the Cramér-Rao bound where the model holds.
@@ -503,13 +501,13 @@ def fit_ellipses(
         e_uu, e_uv, e_vv = (1 + (r / t) ** 2) / (p * p), -r / (p * t * t), 1 / (t * t)
         spread = sqrt(0.25 * (e_uu - e_vv) ** 2 + e_uv * e_uv)
         mean = 0.5 * (e_uu + e_vv)
-        out[k, 0], out[k, 1] = u0 + x[0] * radius, v0 + x[1] * radius
-        out[k, 2], out[k, 3], out[k, 4] = c_uu + aliasing, c_uv, c_vv + aliasing
-        out[k, 5] = radius * sqrt(mean + spread)
-        out[k, 6] = radius * sqrt(max(mean - spread, 0.0))
-        out[k, 7] = 0.5 * atan2(2 * e_uv, e_uu - e_vv)
-        out[k, 8] = blur_px
-        out[k, 9], out[k, 10], out[k, 11] = x[6], x[9], sqrt(variance)
+        out[k, U], out[k, V] = u0 + x[0] * radius, v0 + x[1] * radius
+        out[k, COV_UU], out[k, COV_UV], out[k, COV_VV] = c_uu + aliasing, c_uv, c_vv + aliasing
+        out[k, A] = radius * sqrt(mean + spread)
+        out[k, B] = radius * sqrt(max(mean - spread, 0.0))
+        out[k, THETA] = 0.5 * atan2(2 * e_uv, e_uu - e_vv)
+        out[k, BLUR] = blur_px
+        out[k, AROUND], out[k, STEP], out[k, RESIDUAL] = x[6], x[9], sqrt(variance)
     return out
 
 
@@ -519,4 +517,4 @@ def warm_up() -> None:
     for dtype in (np.uint8, np.uint16):
         image = np.where((u - 12) ** 2 + (v - 12) ** 2 < 20, 50, 200).astype(dtype)
         found = blobs(image, np.full_like(image, 50), np.full_like(image, 200), -1.0, 0.2, 0.0, 3.0, 20.0, 0.3, 0.7)
-        fit_ellipses(image, found[:, :5].copy(), np.zeros(len(found)), -1.0, 0.2, 0.12, 0.0)
+        fit_ellipses(image, found, np.zeros(len(found)), -1.0, 0.2, 0.12, 0.0)

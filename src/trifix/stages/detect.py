@@ -11,7 +11,22 @@ import cv2
 import numpy as np
 from jaxtyping import Float
 
-from trifix.kernels.detection import Grey, blobs, fit_ellipses
+from trifix.kernels.detection import (
+    AROUND,
+    COV_UU,
+    COV_UV,
+    COV_VV,
+    RESIDUAL,
+    STEP,
+    THETA,
+    A,
+    B,
+    Grey,
+    U,
+    V,
+    blobs,
+    fit_ellipses,
+)
 from trifix.records import Dots, GreyOrColour
 
 _SIGNS = (-1.0, 1.0)  # dark, bright
@@ -68,12 +83,12 @@ def detect(image: GreyOrColour, options: DetectOptions) -> Dots:
         (_fits(grey, levels, noise, sign, options) for sign in signs),
         key=lambda fits: _evidence(_misfit(fits, noise), options),
     )
-    fits = fits[np.lexsort((fits[:, 0], fits[:, 1]))]
+    fits = fits[np.lexsort((fits[:, U], fits[:, V]))]
     n = len(fits)
     return Dots(
-        uv_px=fits[:, :2].copy(),
-        cov_px2=fits[:, [2, 3, 3, 4]].reshape(n, 2, 2),
-        ellipse=fits[:, 5:8].copy(),
+        uv_px=fits[:, [U, V]],
+        cov_px2=fits[:, [COV_UU, COV_UV, COV_UV, COV_VV]].reshape(n, 2, 2),
+        ellipse=fits[:, [A, B, THETA]],
         label=np.full(n, -1),
         row=np.arange(n),
     )
@@ -111,7 +126,7 @@ def _candidates(
             _LEVEL_MAX_PX,
             0.9 * options.min_axis_ratio,
             _MIN_FILL,
-        )[:, :5] * np.array([level.size] * 2 + [level.size**2] * 3)
+        ) * np.array([level.size] * 2 + [level.size**2] * 3)
         found[:, :2] += (level.size - 1) / 2
         start.append(found)
         coarseness.append(np.full(len(found), (level.size - 1) / 2))
@@ -124,9 +139,9 @@ def _fits(
     """Accepted fits of one polarity."""
     start, coarseness = _candidates(levels, noise, sign, options)
     fits = fit_ellipses(grey, start, coarseness, sign, options.min_contrast, options.max_misfit, noise)
-    fits = fits[np.isfinite(fits[:, 0])]
-    u, v, a, b = fits[:, 0], fits[:, 1], fits[:, 5], fits[:, 6]
-    around, step = fits[:, 9], np.abs(fits[:, 10])
+    fits = fits[np.isfinite(fits[:, U])]
+    u, v, a, b = fits[:, U], fits[:, V], fits[:, A], fits[:, B]
+    around, step = fits[:, AROUND], np.abs(fits[:, STEP])
     h, w = grey.shape
     good = (
         (2 * a >= options.min_diameter_px)
@@ -143,7 +158,7 @@ def _fits(
 
 def _misfit(fits: Float[np.ndarray, "n 12"], noise: float) -> Float[np.ndarray, "n"]:
     """Residual beyond the noise, as a fraction of the step."""
-    return np.asarray(np.sqrt(np.maximum(fits[:, 11] ** 2 - noise**2, 0.0)) / np.abs(fits[:, 10]))
+    return np.asarray(np.sqrt(np.maximum(fits[:, RESIDUAL] ** 2 - noise**2, 0.0)) / np.abs(fits[:, STEP]))
 
 
 def _distinct(fits: Float[np.ndarray, "n 12"], noise: float) -> Float[np.ndarray, "k 12"]:
@@ -151,7 +166,7 @@ def _distinct(fits: Float[np.ndarray, "n 12"], noise: float) -> Float[np.ndarray
     order = np.argsort(_misfit(fits, noise), kind="stable")
     fits = fits[order]
     close = np.hypot(*(fits[:, None, :2] - fits[None, :, :2]).transpose(2, 0, 1)) < np.maximum(
-        fits[:, None, 6], fits[None, :, 6]
+        fits[:, None, B], fits[None, :, B]
     )
     kept = np.ones(len(fits), dtype=bool)
     for k in range(len(fits)):
