@@ -117,7 +117,7 @@ def shade(
             cosine = max(0.0, (nx * lx + ny * ly + nz * lz) / (distance * length))
             falloff = min(1.4, (working_mm / distance) ** 2)
             albedo = 0.72 + 0.36 * _texture(px / 22, py / 22, pz / 22) + 0.14 * _texture(px / 3, py / 3, pz / 3)
-            grey[v, u] = albedo * (132 * cosine * falloff + 12 + 9 * nz / length)
+            grey[v, u] = albedo * (132 * cosine * falloff + 17 + 9 * nz / length)
 
 
 @njit(cache=True, nogil=True)

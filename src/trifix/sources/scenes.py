@@ -216,22 +216,30 @@ def _over(
 
 
 def _lanes(
-    s: Float[np.ndarray, "n"], x_mm: tuple[float, float], y_mm: tuple[float, float], lanes: int, round_trip: bool = True
-) -> Track:
-    """The point at share s of a path to and fro in lanes along x; it goes back over them, across, where asked."""
-    if round_trip:
-        forth = _lanes((2 * s).clip(0, 1), x_mm, y_mm, lanes, False)
-        back = _lanes((2 * s - 1).clip(0, 1), y_mm, x_mm, lanes, False)[:, [1, 0, 2]]
-        return np.where((s < 0.5)[:, None], forth, back)
-    u = s * lanes
-    lane = np.minimum(np.floor(u), lanes - 1)
-    along = u - lane
-    along = np.where(lane % 2 == 0, along, 1 - along)
-    x = x_mm[0] + along * (x_mm[1] - x_mm[0])
-    # the change of lanes is spread over the last and first tenth of each, so that nothing leaps
-    blend = np.interp(u - lane, [0, 0.1, 0.9, 1], [-0.5, 0, 0, 0.5])
-    y = y_mm[0] + ((lane + blend).clip(0, lanes - 1)) / max(lanes - 1, 1) * (y_mm[1] - y_mm[0])
-    return np.stack([x, y, np.zeros(len(s))], axis=1)
+    s: Float[np.ndarray, "n"], x_mm: tuple[float, float], y_mm: tuple[float, float], lanes: int
+) -> Float[np.ndarray, "n 3"]:
+    """The point at share s of a closed path: there in lanes along x, back across them in lanes along y.
+
+    With an odd number of lanes both ways end in opposite corners, so that nothing leaps.
+    """
+    u = 1 - np.abs(1 - 2 * (s % 1))  # there, and the same share of the other way back
+    return np.where(
+        (s % 1 < 0.5)[:, None], _one_way(u, x_mm, y_mm, lanes), _one_way(u, y_mm, x_mm, lanes)[:, [1, 0, 2]]
+    )
+
+
+def _one_way(
+    s: Float[np.ndarray, "n"], x_mm: tuple[float, float], y_mm: tuple[float, float], lanes: int
+) -> Float[np.ndarray, "n 3"]:
+    """The point at share s of a path in lanes along x."""
+    lane = np.minimum(np.floor(s * lanes), lanes - 1)
+    done = s * lanes - lane
+    along = np.where(lane % 2 == 0, done, 1 - done)
+    # a lane begins and ends half-way to its neighbours
+    across = (lane + np.interp(done, [0, 0.1, 0.9, 1], [-0.5, 0, 0, 0.5])).clip(0, lanes - 1) / (lanes - 1)
+    return np.stack(
+        [x_mm[0] + along * (x_mm[1] - x_mm[0]), y_mm[0] + across * (y_mm[1] - y_mm[0]), np.zeros(len(s))], axis=1
+    )
 
 
 def _still(xyz_mm: Float[np.ndarray, "k 3"], normal: Float[np.ndarray, "k 3"], n: int) -> Targets:
@@ -253,7 +261,7 @@ def _statue(n: int, layout: np.random.Generator, hand: np.random.Generator) -> S
         rise_mm=25,
         lapse_mm=340,
         lapse_every=75,
-        lapse_length=32,
+        lapse_length=31,
     )
     return Scene(surface, targets, rig, poses)
 
@@ -310,7 +318,7 @@ def _grid(n: int, layout: np.random.Generator, hand: np.random.Generator) -> Sce
     x, y = (g.ravel() for g in np.meshgrid(45 + pitch_mm * np.arange(12), 35 + pitch_mm * np.arange(10)))
     xyz = np.stack([x, y, np.zeros(len(x))], axis=1)
     xyz[:, :2] += layout.normal(0, 0.01 * pitch_mm, (len(x), 2))
-    aim = _lanes(np.arange(n) / 1000, (150, 750), (150, 550), 4)
+    aim = _lanes(np.arange(n) / 1000, (150, 750), (150, 550), 5)
     normal = np.tile([0.0, 0.0, 1.0], (len(x), 1))
     return Scene(surface, _still(xyz, normal, n), rig, _over(rig, hand, aim, 430))
 
@@ -343,7 +351,7 @@ def _steps(n: int, layout: np.random.Generator, hand: np.random.Generator) -> Sc
     surface = joined(parts)
     targets = _still(*surface.scatter(90, layout), n)
     aim = _lanes(np.arange(n) / 1200, (140, 760), (120, 480), 3) + np.array([0, 0, 75])
-    return Scene(surface, targets, rig, _over(rig, hand, aim, 430, tilt_deg=32))
+    return Scene(surface, targets, rig, _over(rig, hand, aim, 430, tilt_deg=42))
 
 
 def _corridor(n: int, layout: np.random.Generator, hand: np.random.Generator) -> Scene:
@@ -390,7 +398,7 @@ def _moved(n: int, layout: np.random.Generator, hand: np.random.Generator) -> Sc
     valid_from, valid_to = np.zeros(count + movers, dtype=np.int64), np.full(count + movers, n)
     valid_to[leaving] = midway
     valid_from[count:] = midway
-    aim = _lanes((2 * np.arange(n) / n) % 1, (130, 770), (120, 480), 3)
+    aim = _lanes(2 * np.arange(n) / n, (130, 770), (120, 480), 3)
     return Scene(surface, Targets(xyz, normal, valid_from, valid_to), rig, _over(rig, hand, aim, 430))
 
 
@@ -436,11 +444,11 @@ def _closure(n: int, layout: np.random.Generator, hand: np.random.Generator) -> 
 
 
 def _demo(n: int, layout: np.random.Generator, hand: np.random.Generator) -> Scene:
-    rig = _rig(f_px=1000, size_px=(960, 720), baseline_mm=110, crossing_mm=430)
+    rig = _rig(f_px=1050, size_px=(960, 720), baseline_mm=90, crossing_mm=450)
     surface = head(230)
     azimuth = -0.5 + 0.017 * np.arange(n)
-    poses = _round(rig, hand, azimuth, 430, elevation_deg=12, rise_mm=15, astray_mm=8)
-    xyz, normal = surface.scatter(40, layout, where=lambda xyz: xyz[:, 0] > -0.1 * 230)
+    poses = _round(rig, hand, azimuth, 450, elevation_deg=12, rise_mm=15, astray_mm=8)
+    xyz, normal = surface.scatter(44, layout, where=lambda xyz: xyz[:, 0] > 0)
     return Scene(surface, _still(xyz, normal, n), rig, poses)
 
 
@@ -468,5 +476,5 @@ SCENES: dict[str, Recipe] = {
     "clutter": Recipe("a head with as many false dots as true ones", 1000, _clutter),
     "dwell": Recipe("long over one region, then over all: misleads frequency counts", 1000, _dwell),
     "closure": Recipe("once round and a little more: misleads frequency counts", 1000, _closure),
-    "demo": Recipe("a head with 40 targets, a short quiet tour, made to be rendered", 60, _demo),
+    "demo": Recipe("a head with 44 targets, a short quiet tour, made to be rendered", 60, _demo),
 }

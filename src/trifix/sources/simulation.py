@@ -4,7 +4,9 @@
 seed gives the same bytes. Knows no stage: truth is not computed by the code that it is there to test.
 """
 
-from collections.abc import Callable, Sequence
+import shutil
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import assert_never
@@ -153,25 +155,36 @@ def simulate(
     Raises:
         SimulationError: as ``simulate_frames``; or ``out`` holds a recording or a truth already.
     """
-    out = Path(out)
     recording, truth = out / "recording", out / "truth"
     for folder in (recording, truth):
         if folder.exists():
             raise SimulationError(f"{folder} exists already: choose another folder, or remove it first.")
     simulation = simulate_frames(scene, seed, level, frames, None if level == "images" else progress)
-    recording.mkdir(parents=True)
-    write_rig(simulation.scene.rig, recording / "calibration.yaml")
-    write_frames(recording / "frames.csv", simulation.truth.frames.index, simulation.truth.frames.timestamp_ns)
-    match level:
-        case "images":
-            _write_images(simulation.frames, recording, progress)
-        case "dots":
-            _write_dots(simulation, recording / "dots.csv")
-        case "points":
-            _write_points(simulation, recording / "points.csv")
-        case _:
-            assert_never(level)
-    write_truth(simulation.truth, truth, None if level == "images" else level)
+    with _whole_or_not_at_all(recording) as folder:
+        write_rig(simulation.scene.rig, folder / "calibration.yaml")
+        write_frames(folder / "frames.csv", simulation.truth.frames.index, simulation.truth.frames.timestamp_ns)
+        match level:
+            case "images":
+                _write_images(simulation.frames, folder, progress)
+            case "dots":
+                _write_dots(simulation, folder / "dots.csv")
+            case "points":
+                _write_points(simulation, folder / "points.csv")
+            case _:
+                assert_never(level)
+    with _whole_or_not_at_all(truth) as folder:
+        write_truth(simulation.truth, folder, None if level == "images" else level)
+
+
+@contextmanager
+def _whole_or_not_at_all(folder: Path) -> Iterator[Path]:
+    """A folder to write into, which gets its name when all is written; what an interruption left is removed."""
+    part = folder.with_name(folder.name + ".part")
+    if part.exists():
+        shutil.rmtree(part)
+    part.mkdir(parents=True)
+    yield part
+    part.rename(folder)
 
 
 def _write_dots(simulation: Simulation, path: Path) -> None:

@@ -173,7 +173,7 @@ def head(height_mm: float) -> Surface:
     bare = Surface(vertex, face, np.ones(len(face), dtype=bool))
     bend = np.einsum("fi,fci->fc", bare.face_normal, bare.vertex_normal[face]).min(axis=1)
     above_neck = vertex[face, 2].mean(axis=1) > -0.42 * height_mm
-    return Surface(vertex, face, (bend > np.cos(np.radians(8))) & above_neck)
+    return Surface(vertex, face, (bend > np.cos(np.radians(14))) & above_neck)
 
 
 def _unit(v: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:

@@ -163,8 +163,7 @@ def _information(
 
 
 def write_truth(truth: SimulatedTruth, folder: Path, labels: str | None) -> None:
-    """Writes the truth folder; ``labels`` is the table that the labels belong to, dots or points, or None."""
-    folder.mkdir(parents=True)
+    """Writes into the truth folder; ``labels`` is the table that the labels belong to, dots or points, or None."""
     frames, targets = truth.frames, truth.targets
     header = "# timestamp_s tx ty tz qx qy qz qw (left camera in map coordinates, metres)"
     rows = [tum_row(t, pose) for t, pose in zip(frames.timestamp_ns.tolist(), frames.T_map_sensor, strict=True)]
