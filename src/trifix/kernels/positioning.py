@@ -7,8 +7,11 @@ sensor coordinates, T · exp(δ), as everywhere.
 import numpy as np
 from numba import njit
 
-# A hypothesis is grown by at most this many ways of saying how much of a frame is clutter; see ``grow``.
 CLUTTER_SHARES = np.array([0.1, 0.3, 0.5, 0.7, 0.9])
+"""Shares of a frame's points that are clutter; a hypothesis is weighed under each of them, see ``grow``."""
+
+TARGETS_AROUND = 2.5
+"""κ: a normal density of the spread of five neighbours stands for this many targets (five on a disc: 2π · 5/4π)."""
 
 
 # --- triangles -------------------------------------------------------------------------------------------------------
@@ -358,6 +361,13 @@ def _inverse3(S, out):
 
 
 @njit(cache=True, nogil=True)
+def _determinant3(S):
+    """Determinant of a symmetric 3 x 3 matrix."""
+    a, b, c, d, e, f = S[0, 0], S[0, 1], S[0, 2], S[1, 1], S[1, 2], S[2, 2]
+    return a * (d * f - e * e) + b * (c * e - b * f) + c * (b * e - c * d)
+
+
+@njit(cache=True, nogil=True)
 def _inverse6(A, out):
     """Inverse of a symmetric positive 6 x 6 matrix by Cholesky; False where it is not positive."""
     L = np.zeros((6, 6))
@@ -557,7 +567,7 @@ def grow(
     target_xyz,
     target_cov,
     target_view,
-    target_density,
+    target_spread,
     used_target,
     start,
     item,
@@ -572,14 +582,15 @@ def grow(
     ``matched`` (n) receives the row of the target of each point, -1 for none, -2 for a point that was passed over
     because its prediction was still too vague, or because two targets competed for it.
 
-    ``log_ratio`` (one entry a clutter share c) gains ln(c + (1 − c) · N₂(d) / ρ) for a point with a target at
-    Mahalanobis distance d, and ln c for one without: the likelihood of the point if the pose is right, against a point
-    that falls by chance on the surface on which the targets lie with ρ per mm². N₂ is the density in the plane in
-    which the prediction is vaguest, so that lying on the common surface is no evidence. Each point is predicted from
-    points before it only; its factor therefore has mean ≤ 1 if the pose is wrong, and so has the product.
+    ``log_ratio`` (one entry a clutter share c) gains ln(c + (1 − c) · N(r; S) / q) for a point with a target at
+    residual r, and ln c for one without: the likelihood of the point if the pose is right, against that of a point that
+    falls by chance where targets are. q = κ N(0; S + Σ) is the density of targets around that one, with Σ the
+    ``target_spread`` of its neighbours: where they lie in a plane, lying in it is no evidence. Each point is predicted
+    from points before it only; its factor therefore has mean ≤ 1 if the pose is wrong, and so has the product.
     """
     S = np.empty((3, 3))
     G = np.empty((3, 3))
+    Q = np.empty((3, 3))
     B = np.empty((3, 3))
     J = np.empty((3, 6))
     PJ = np.empty((6, 3))
@@ -622,7 +633,7 @@ def grow(
         reach = max(reach, 0.05 * cell_mm) + 0.25 * cell_mm  # and some for the targets' own covariance
         best = -1
         best_d2 = 1e300
-        best_area = 0.0
+        best_ratio = 0.0
         second_d2 = 1e300
         i0, i1 = int(np.floor((x[0] - reach) / cell_mm)), int(np.floor((x[0] + reach) / cell_mm))
         j0, j1 = int(np.floor((x[1] - reach) / cell_mm)), int(np.floor((x[1] + reach) / cell_mm))
@@ -661,15 +672,8 @@ def grow(
                         if m2 < best_d2:
                             second_d2 = best_d2
                             best, best_d2 = q, m2
-                            # sum of the principal minors: a little over the two largest eigenvalues' product
-                            best_area = np.sqrt(
-                                S[0, 0] * S[1, 1]
-                                - S[0, 1] ** 2
-                                + S[0, 0] * S[2, 2]
-                                - S[0, 2] ** 2
-                                + S[1, 1] * S[2, 2]
-                                - S[1, 2] ** 2
-                            )
+                            _innovation_frame(R, S, target_spread[q], Q)
+                            best_ratio = np.sqrt(_determinant3(Q) / _determinant3(S)) / TARGETS_AROUND
                         elif m2 < second_d2:
                             second_d2 = m2
         if best >= 0 and second_d2 - best_d2 < 6.0:
@@ -680,7 +684,7 @@ def grow(
             for c in range(len(shares)):
                 log_ratio[c] += np.log(shares[c])
             continue
-        peak = np.exp(-0.5 * best_d2) / (2.0 * np.pi * best_area * target_density[best])
+        peak = np.exp(-0.5 * best_d2) * best_ratio
         for c in range(len(shares)):
             log_ratio[c] += np.log(shares[c] + (1.0 - shares[c]) * peak)
         matched[n] = best
@@ -724,7 +728,7 @@ def score_hypotheses(
     target_xyz,
     target_cov,
     target_view,
-    target_density,
+    target_spread,
     start,
     item,
     cell_mm,
@@ -792,7 +796,7 @@ def score_hypotheses(
             target_xyz,
             target_cov,
             target_view,
-            target_density,
+            target_spread,
             used_target,
             start,
             item,
@@ -864,7 +868,7 @@ def warm_up() -> None:
     rows = np.arange(len(xyz))
     none = np.full(len(xyz), -1)
     view = np.tile([0.0, 0.0, -1.0], (len(xyz), 1))
-    density = np.full(len(xyz), 1e-3)
+    spread = cov.copy()
     neighbours = nearest(xyz, 4)
     described = describe_triangles(xyz, cov, -xyz, local_triangles(neighbours), 0.3)
     longest_last = np.argsort(described[1][:, 2])
@@ -872,12 +876,12 @@ def warm_up() -> None:
     points, targets, _, _ = match_triangles(*described, *sorted_by_length, 3.0, 0.0, 1000)
     oriented = orient_triangles(xyz, cov, points, xyz, cov, targets)
     grid = build_grid(xyz, rows, 10.0)
-    scene = (xyz, cov, none, none, xyz, cov, view, density)
+    scene = (xyz, cov, none, none, xyz, cov, view, spread)
     score_hypotheses(*oriented, points, targets, neighbours, *scene, *grid, 10.0, 4.0)
     R, t, P, _ = (column[0].copy() for column in oriented)
     used = np.zeros(len(xyz) + 1, dtype=np.bool_)
     log_ratio = np.zeros(len(CLUTTER_SHARES))
-    targets_with_free = (xyz, cov, view, density, used.copy())
+    targets_with_free = (xyz, cov, view, spread, used.copy())
     grow(R, t, P, rows, xyz, cov, none, none, used, used, *targets_with_free, *grid, 10.0, 4.0, none.copy(), log_ratio)
     log_mean(log_ratio)
     head, best = np.full(len(xyz), -1), np.full((len(xyz), 3), -1)

@@ -7,6 +7,7 @@ bounds the probability of accepting a wrong one. The three points that made the 
 """
 
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -32,6 +33,13 @@ from trifix.records import (
 class VerifyOptions:
     """When a pose is believed."""
 
+    method: Literal["probability", "residual"] = "probability"
+    """By the probability that the agreement is chance, or by the residuals alone (Khoury 2006); the latter needs all
+    hypotheses at once: let identify.portion be large."""
+    counterpart_mm: float = 3.0
+    """residual: a point has found its target if it is the only one within this distance (mm)."""
+    max_residual_mm: float = 1.0
+    """residual: largest rms distance of the points from their targets (mm)."""
     max_p_chance: float = 1e-9
     """Largest bound on the probability that the agreement is chance."""
     min_rival_odds: float = 1e6
@@ -52,6 +60,8 @@ class VerifyOptions:
             raise ConfigError(f"verify.max_p_chance is {self.max_p_chance}, expected a probability between 0 and 1.")
         if self.min_rival_odds < 1:
             raise ConfigError(f"verify.min_rival_odds is {self.min_rival_odds}, expected at least 1.")
+        if min(self.counterpart_mm, self.max_residual_mm) <= 0:
+            raise ConfigError("verify.counterpart_mm and verify.max_residual_mm must be positive.")
         if min(self.gate_sigmas, self.max_sigma_mm, self.max_sigma_deg, self.max_solutions) <= 0:
             raise ConfigError("verify.gate_sigmas, max_sigma_mm, max_sigma_deg and max_solutions must be positive.")
 
@@ -73,7 +83,7 @@ class Solution:
 
 
 _QUICK_NEIGHBOURS = 12  # of each of the three points, for the first look
-_DENSITY_NEIGHBOURS = 5
+_SURROUNDING = 5  # neighbours of a target that tell how targets lie around it
 
 
 def verify(
@@ -94,11 +104,11 @@ def verify(
     """
     if len(identification) == 0:
         return NoFix(Reason.no_candidate)
-    density = target_density(map.xyz_mm, np.flatnonzero(map.alive))
-    solutions = solve(points, map, identification, orientations, matches, density, options)
+    spread, spacing_mm = surroundings(map)
+    solutions = solve(points, map, identification, orientations, matches, spread, options)
     if not solutions:
         return NoFix(Reason.no_candidate, "Every hypothesis looks at targets from behind or has its points on a line.")
-    return judge(solutions, points, map, density, tried or len(identification), options)
+    return judge(solutions, points, map, spacing_mm, tried or len(identification), options)
 
 
 def solve(
@@ -107,7 +117,7 @@ def solve(
     identification: Identification,
     orientations: Orientations,
     matches: StereoMatches | None,
-    density: Float[np.ndarray, "k"],
+    spread: Float[np.ndarray, "k 3 3"],
     options: VerifyOptions,
 ) -> list[Solution]:
     """The different solutions that the hypotheses lead to, best first."""
@@ -118,7 +128,7 @@ def solve(
     target_sigma2 = np.trace(map.cov_mm2[alive], axis1=1, axis2=2)
     cell_mm = max(2.0 * options.gate_sigmas * float(np.sqrt(np.median(sigma2) + np.median(target_sigma2))), 1e-3)
     grid = kernels.build_grid(map.xyz_mm, alive, cell_mm)
-    scene = (map.xyz_mm, map.cov_mm2, map.view, density)
+    scene = (map.xyz_mm, map.cov_mm2, map.view, spread)
     neighbours = kernels.nearest(points.xyz_mm, min(_QUICK_NEIGHBOURS, n - 1))
     score = kernels.score_hypotheses(
         orientations.R,
@@ -185,7 +195,7 @@ def judge(
     solutions: list[Solution],
     points: SensorPoints,
     map: ReferenceMap,
-    density: Float[np.ndarray, "k"],
+    spacing_mm: Float[np.ndarray, "k"],
     tried: int,
     options: VerifyOptions,
 ) -> Fix | NoFix:
@@ -205,7 +215,7 @@ def judge(
             f"{len(best.point)} of {len(points)} points agree with the map to {rms_mm:.2f} mm; "
             f"by chance so in up to {p_chance:.1e} of such frames.",
         )
-    rivals = [s for s in solutions if s is best or _is_rival(best, s, points, density, options)]
+    rivals = [s for s in solutions if s is best or _is_rival(best, s, points, spacing_mm, options)]
     if len(rivals) > 1:
         return refuse(
             Reason.ambiguous,
@@ -237,17 +247,22 @@ def pose_sigma(cov: Float[np.ndarray, "6 6"], xyz_mm: Float[np.ndarray, "c 3"]) 
     return float(np.sqrt(variance.mean())), float(np.degrees(np.sqrt(np.linalg.eigvalsh(cov[3:, 3:])[-1])))
 
 
-def target_density(xyz_mm: Float[np.ndarray, "k 3"], alive: Int[np.ndarray, "a"]) -> Float[np.ndarray, "k"]:
-    """Targets per mm² of surface around each living target, from the distance of its fifth neighbour."""
+def surroundings(
+    map: ReferenceMap,
+) -> tuple[Float[np.ndarray, "k 3 3"], Float[np.ndarray, "k"]]:
+    """Around each living target: the mean square offsets of its five nearest (mm²), and the spacing (mm)."""
     from scipy.spatial import cKDTree
 
-    density = np.full(len(xyz_mm), np.inf)
-    k = min(_DENSITY_NEIGHBOURS, len(alive) - 1)
-    if k < 1:
-        return density
-    distance, _ = cKDTree(xyz_mm[alive]).query(xyz_mm[alive], k=k + 1)
-    density[alive] = k / (np.pi * np.maximum(distance[:, -1], 1e-6) ** 2)
-    return density
+    alive = np.flatnonzero(map.alive)
+    spread, spacing_mm = np.zeros((len(map), 3, 3)), np.zeros(len(map))
+    k = min(_SURROUNDING, len(alive) - 1)
+    if k >= 1:
+        xyz = map.xyz_mm[alive]
+        distance, nearest = cKDTree(xyz).query(xyz, k=k + 1)
+        offset = xyz[nearest[:, 1:]] - xyz[:, None]
+        spread[alive] = np.einsum("nki,nkj->nij", offset, offset) / k
+        spacing_mm[alive] = distance[:, -1] * np.sqrt(np.pi / k)
+    return spread, spacing_mm
 
 
 def _refined(
@@ -283,7 +298,7 @@ def _is_rival(
     best: Solution,
     other: Solution,
     points: SensorPoints,
-    density: Float[np.ndarray, "k"],
+    spacing_mm: Float[np.ndarray, "k"],
     options: VerifyOptions,
 ) -> bool:
     """Whether another solution puts the points elsewhere and yet comes too near the best in explaining them.
@@ -295,7 +310,7 @@ def _is_rival(
     apart = (best.T_world_sensor.inverse() @ other.T_world_sensor).apply(points.xyz_mm[p]) - points.xyz_mm[p]
     d2 = np.einsum("ni,ni->n", apart, np.linalg.solve(points.cov_mm2[p], apart[:, :, None])[:, :, 0])
     is_elsewhere = np.median(d2) > options.gate_sigmas**2
-    is_on_others = np.median(np.linalg.norm(apart, axis=1) * np.sqrt(density[best.target])) > 0.5
+    is_on_others = np.median(np.linalg.norm(apart, axis=1) / spacing_mm[best.target]) > 0.5
     is_near = other.log_ratio > best.log_ratio - np.log(options.min_rival_odds)
     explains_as_many = len(other.point) >= options.max_rival_share * len(best.point)
     return bool((is_elsewhere and is_near) or (is_on_others and explains_as_many))
