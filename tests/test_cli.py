@@ -175,6 +175,30 @@ def test_results_are_compared_with_the_truth(room: Path) -> None:
     assert "misidentified" in done.stdout
 
 
+def test_a_simulated_recording_can_be_positioned(tmp_path: Path) -> None:
+    made = trifix("simulate", "demo", "-o", tmp_path, "--frames", 5, "--seed", 3)
+    assert (made.code, made.stdout) == (0, "")
+    assert trifix("run", tmp_path / "recording", "-o", tmp_path / "results").code == 0
+    again = trifix("simulate", "demo", "-o", tmp_path, "--frames", 5)
+    assert again.code == 1
+    assert "exists already: choose another folder" in again.stderr
+
+
+def test_a_second_demo_positions_the_recording_of_the_first(tmp_path: Path) -> None:
+    shutil.copytree(SMALL, tmp_path / "demo")
+    done = trifix("demo", "-o", tmp_path / "demo")
+    assert done.code == 0, done.stderr
+    assert "40  of 40 frames" in done.stdout
+    assert (tmp_path / "demo" / "results" / "report.html").exists()
+
+
+def test_warming_up_reaches_every_kernel_module() -> None:
+    kernels = list((Path(cli.__file__).parent / "kernels").glob("[!_]*.py"))
+    done = trifix("warmup")
+    assert done.code == 0
+    assert f"{len(kernels)}/{len(kernels)}" in done.stderr
+
+
 def test_a_given_map_is_left_as_it_is(room: Path, tmp_path: Path) -> None:
     done = trifix(
         "run",

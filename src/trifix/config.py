@@ -12,11 +12,9 @@ import textwrap
 import tomllib
 from collections.abc import Mapping
 from dataclasses import Field, dataclass, field, fields, is_dataclass, replace
-from enum import Enum
 from functools import cache
 from pathlib import Path
-from types import NoneType, UnionType
-from typing import ClassVar, Literal, Protocol, TypeVar, Union, get_args, get_origin, get_type_hints, runtime_checkable
+from typing import ClassVar, Literal, Protocol, TypeVar, get_args, get_origin, get_type_hints, runtime_checkable
 
 import msgspec
 
@@ -92,7 +90,7 @@ def with_overrides(config: Config, overrides: Mapping[str, str]) -> Config:
 
 
 def to_toml(config: Dataclass) -> str:
-    """The options as TOML that ``read_config`` reads back, each with its sentence; unset ones are commented out."""
+    """The options as TOML that ``read_config`` reads back, each under its sentence."""
     return "\n".join(_toml_lines(config, section="")).strip() + "\n"
 
 
@@ -150,41 +148,21 @@ def _suggestion(name: str, known: list[str], section: str) -> str:
 
 def _described(expected: object) -> str:
     """A type in words."""
-    arguments = get_args(expected)
-    origin = get_origin(expected)
-    if origin is Literal:
-        return "one of " + ", ".join(_shown(each) for each in arguments)
-    if origin in (Union, UnionType):
-        return " or ".join(_described(each) for each in arguments if each is not NoneType)
-    if origin is tuple:
-        several = [each for each in arguments if each is not Ellipsis]
-        return "a list of " + (_described(several[0]) if Ellipsis in arguments else f"{len(several)} values")
-    if isinstance(expected, type) and issubclass(expected, Enum):
-        return "one of " + ", ".join(_shown(each.value) for each in expected)
-    words: dict[object, str] = {
-        bool: "true or false",
-        int: "a whole number",
-        float: "a number",
-        str: "a text in quotes",
-    }
-    return words.get(expected, str(expected))
+    if get_origin(expected) is Literal:
+        return "one of " + ", ".join(map(_shown, get_args(expected)))
+    words: dict[object, str] = {bool: "true or false", int: "a whole number", float: "a number", str: "a text"}
+    return words[expected]
 
 
 def _shown(value: object) -> str:
     """A value as it would stand in TOML."""
     match value:
-        case bool():
-            return str(value).lower()
-        case str():
-            return json.dumps(value, ensure_ascii=False)
-        case Enum():
-            return _shown(value.value)
-        case list() | tuple():
-            return "[" + ", ".join(_shown(each) for each in value) + "]"
         case dict():
             return "a section"
-        case _:
+        case float():
             return repr(value)
+        case _:
+            return json.dumps(value, ensure_ascii=False, default=str)
 
 
 def _toml_value(text: str) -> object:
@@ -205,5 +183,5 @@ def _toml_lines(options: Dataclass, section: str) -> list[str]:
             continue
         if each.name in explained:
             own += textwrap.wrap(explained[each.name], 117, initial_indent="# ", subsequent_indent="# ")
-        own.append(f"# {each.name} =" if value is None else f"{each.name} = {_shown(value)}")
+        own.append(f"{each.name} = {_shown(value)}")
     return own + below
