@@ -20,6 +20,7 @@ from trifix.records import (
     Frame,
     Identification,
     NoFix,
+    Orientations,
     PositionedReason,
     Reason,
     ReferenceMap,
@@ -37,6 +38,7 @@ from trifix.stages.orient import orient
 from trifix.stages.triangulate import triangulate
 from trifix.stages.update import found_map, update
 from trifix.stages.verify import verify
+from trifix.stages.verify_residual import verify_residual
 from trifix.stages.weigh import NoiseScale, add_prior_noise, scale_points, weigh_matches, weigh_residuals
 
 
@@ -60,6 +62,7 @@ class Positioner:
         self._is_noise_stated = is_noise_stated
         self._next_id = int(self.map.id.max(initial=-1)) + 1
         self._last_ns = -(1 << 63)
+        self._last_pose: Pose | None = None
         self._identifier = identifier(self.config.identify)
         self._identifier.learn(self.map, np.zeros(0, dtype=np.int64))
         self._cameras = ThreadPoolExecutor(2, thread_name_prefix="camera")
@@ -132,23 +135,42 @@ class Positioner:
         if len(self.map) == 0:
             return None, _define_world(points)
         best, tried = NoFix(Reason.no_candidate), 0
-        portions = self._identifier.identify(points, self.map)
+        portions = self._identifier.identify(points, self.map, self._last_pose)
         identification = None
-        while best.why in (Reason.no_candidate, Reason.not_proven):
+        while best.why in (Reason.no_candidate, Reason.not_proven, Reason.residual):
             with clock("identify"):
-                identification = next(portions, None)
-            if identification is None:
+                portion = next(portions, None)
+            if portion is None:
                 break
+            identification = portion
             tried += len(identification)
             with clock("orient"):
                 orientations = orient(points, self.map, identification)
             with clock("verify"):
-                fix = verify(points, self.map, identification, orientations, matches, tried, self.config.verify)
+                fix = self._verify(points, matches, identification, orientations, tried)
             if isinstance(fix, Fix):
                 return identification, fix
             if fix.why is not Reason.no_candidate:
                 best = fix
         return identification, best
+
+    def _verify(
+        self,
+        points: SensorPoints,
+        matches: StereoMatches | None,
+        identification: Identification,
+        orientations: Orientations,
+        tried: int,
+    ) -> Fix | NoFix:
+        """Poses to the one that is proven, by the method that the options name."""
+        options = self.config.verify
+        match options.method:
+            case "probability":
+                return verify(points, self.map, identification, orientations, matches, tried, options)
+            case "residual":
+                return verify_residual(points, self.map, orientations, options.counterpart_mm, options.max_residual_mm)
+            case _:
+                assert_never(options.method)
 
     def _learn(
         self,
@@ -162,6 +184,7 @@ class Positioner:
         none = np.zeros(0, dtype=np.int64)
         if points is None or isinstance(fix, NoFix):
             return none
+        self._last_pose = fix.T_world_sensor
         if matches is None:
             self.noise = weigh_residuals(self.noise, points, self.map, fix, self._is_noise_stated, self.config.noise)
         elif fix.reason is not PositionedReason.defines_world:
