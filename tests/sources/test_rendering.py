@@ -78,6 +78,14 @@ def test_a_nearer_triangle_covers_a_farther_one_and_backs_are_not_drawn():
     assert (owner == -1).all()
 
 
+def test_rendered_frames_can_be_asked_for_like_any_sequence(demo):
+    assert [frame.index for frame in demo.frames[1:5:3]] == [1, 4]
+    assert demo.frames[-1].index == 59
+    with pytest.raises(IndexError):
+        demo.frames[60]
+    np.testing.assert_array_equal(demo.frames[4].content.left, demo.frames[4].content.left)
+
+
 def test_everything_is_compiled_after_the_warm_up(demo):
     warm_up()
     before = len(draw_faces.signatures)

@@ -100,6 +100,16 @@ def test_dots_are_the_centres_of_ellipses():
     assert shift > 0.03  # the image of the centre is elsewhere
 
 
+@pytest.mark.parametrize("name", ["plane", "sphere", "grid", "demo"])
+def test_both_cameras_look_at_the_same_place_from_the_same_distance(name):
+    scene = made(name, 40)
+    left, right = sightings(scene, 0), sightings(scene, 1)
+    assert 0.8 < len(left.frame) / len(right.frame) < 1.25
+    assert 0.9 < np.median(left.diameter_px) / np.median(right.diameter_px) < 1.1
+    axis = scene.rig.T_right_left.inverse().R[:, 2]  # the right camera's, which leans to the left and meets the left's
+    assert 0.1 < -axis[0] / axis[2] < 0.5
+
+
 def test_noise_grows_with_obliquity():
     scene = made("head", 30)
     seen = sightings(scene, 0)

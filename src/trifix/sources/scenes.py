@@ -121,7 +121,7 @@ def _rig(
     inwards = np.arctan(0.5 * baseline_mm / crossing_mm)
     # no rig is assembled exactly: a fifth of a degree about the other two axes
     R_left_right = exp_rotation(np.array([0.0, -2 * inwards, 0.0])) @ exp_rotation(np.array([0.0035, 0.0, -0.003]))
-    centre = baseline_mm * np.array([np.cos(inwards), 0.004, -np.sin(inwards)])
+    centre = baseline_mm * np.array([np.cos(inwards), 0.004, np.sin(inwards)])
     T_left_right = Pose(R_left_right, centre)
     return StereoRig(camera(1.0, 7.3, -4.1), camera(1.006, -5.6, 3.2), T_left_right.inverse())
 
@@ -261,7 +261,7 @@ def _statue(n: int, layout: np.random.Generator, hand: np.random.Generator) -> S
         rise_mm=25,
         lapse_mm=340,
         lapse_every=75,
-        lapse_length=31,
+        lapse_length=33,
     )
     return Scene(surface, targets, rig, poses)
 
@@ -372,7 +372,7 @@ def _corridor(n: int, layout: np.random.Generator, hand: np.random.Generator) ->
     heading = np.radians(np.interp(s, [0, 0.36, 0.53, 0.86, 1], [150, 150, -30, -30, -210]))
     t = np.arange(n, dtype=float)
     heading = heading + _wander(hand, t, 150, 0.08)
-    pitch = _wander(hand, t, 130, 0.16)
+    pitch = _wander(hand, t, 130, 0.28)
     forward = np.stack([np.cos(heading), np.sin(heading), pitch], axis=1)
     place = np.stack([np.full(n, w / 2) + _wander(hand, t, 170, 60), y, h / 2 + _wander(hand, t, 190, 70)], axis=1)
     place += np.stack([_wander(hand, t, 9, 0.8) for _ in range(3)], axis=1)

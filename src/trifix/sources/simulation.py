@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import assert_never
+from typing import assert_never, overload
 
 import numpy as np
 from jaxtyping import Int
@@ -131,10 +131,14 @@ class _Rendered(Sequence[Frame]):
     def __len__(self) -> int:
         return len(self._timestamp_ns)
 
-    def __getitem__(self, k: int) -> Frame:  # type: ignore[override]  # frames are asked for one by one
-        if not -len(self) <= k < len(self):
-            raise IndexError(k)
-        k %= len(self)
+    @overload
+    def __getitem__(self, k: int) -> Frame: ...
+    @overload
+    def __getitem__(self, k: slice) -> list[Frame]: ...
+    def __getitem__(self, k: int | slice) -> Frame | list[Frame]:
+        if isinstance(k, slice):
+            return [self[i] for i in range(*k.indices(len(self)))]
+        k = range(len(self))[k]
         left, right = self._renderer.render(k, np.random.default_rng([self._seed, _SENSOR, k]))
         return Frame(k, self._timestamp_ns[k], self._rig, StereoImages(left, right))
 
