@@ -5,6 +5,7 @@ was seen once and never again although it should have been, goes. Knows no image
 """
 
 from dataclasses import dataclass
+from typing import Literal, assert_never
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -19,6 +20,9 @@ from trifix.records import Fix, ReferenceMap, SensorPoints, StereoMatches, Targe
 class UpdateOptions:
     """How the map grows and what it drops."""
 
+    method: Literal["kalman", "mean"] = "kalman"
+    """A sighting counts by its covariance (Smith, Self and Cheeseman 1990), or as much as every other one; prefer the
+    mean only to see what the covariances are worth."""
     trusted_after: int = 3
     """Sightings after which a target is trusted."""
     new_target_sigmas: float = 6.0
@@ -52,12 +56,15 @@ def update(
     p, q = fix.point, fix.target
     cov_world = world_covariance(points.xyz_mm[p], points.cov_mm2[p], T, fix.cov)
 
-    # Kalman update of each target: K = C (C + C_seen)⁻¹
-    C = map.cov_mm2[q]
-    K = np.swapaxes(np.linalg.solve(C + cov_world, C), 1, 2)
-    map.xyz_mm[q] += (K @ (T.apply(points.xyz_mm[p]) - map.xyz_mm[q])[:, :, None])[:, :, 0]
-    updated = C - K @ C
-    map.cov_mm2[q] = 0.5 * (updated + np.swapaxes(updated, 1, 2))
+    sighting = T.apply(points.xyz_mm[p])
+    match options.method:
+        case "kalman":
+            map.xyz_mm[q], map.cov_mm2[q] = _filtered(map.xyz_mm[q], map.cov_mm2[q], sighting, cov_world)
+        case "mean":
+            n = np.maximum(map.sightings[q], 1)  # a position that was given counts as one sighting
+            map.xyz_mm[q], map.cov_mm2[q] = _averaged(n, map.xyz_mm[q], map.cov_mm2[q], sighting, cov_world)
+        case _:
+            assert_never(options.method)
     towards = _unit(T.t_mm - map.xyz_mm[q])
     seen = map.sightings[q, None]
     map.view[q] = _unit(np.where(np.isfinite(map.view[q]), map.view[q] * np.maximum(seen, 1), 0.0) + towards)
@@ -75,6 +82,31 @@ def update(
 
     new = _new_points(map, points, matches, fix, options)
     return _with_points(map, points, new, T, fix.cov, frame_index, next_id)
+
+
+def _filtered(
+    xyz_mm: Float[np.ndarray, "c 3"],
+    cov_mm2: Float[np.ndarray, "c 3 3"],
+    sighting_mm: Float[np.ndarray, "c 3"],
+    sighting_cov_mm2: Float[np.ndarray, "c 3 3"],
+) -> tuple[Float[np.ndarray, "c 3"], Float[np.ndarray, "c 3 3"]]:
+    """Positions and covariances after one Kalman update each: K = C (C + C_seen)⁻¹."""
+    K = np.swapaxes(np.linalg.solve(cov_mm2 + sighting_cov_mm2, cov_mm2), 1, 2)
+    cov = cov_mm2 - K @ cov_mm2
+    return xyz_mm + (K @ (sighting_mm - xyz_mm)[:, :, None])[:, :, 0], 0.5 * (cov + np.swapaxes(cov, 1, 2))
+
+
+def _averaged(
+    n: Int[np.ndarray, "c"],
+    xyz_mm: Float[np.ndarray, "c 3"],
+    cov_mm2: Float[np.ndarray, "c 3 3"],
+    sighting_mm: Float[np.ndarray, "c 3"],
+    sighting_cov_mm2: Float[np.ndarray, "c 3 3"],
+) -> tuple[Float[np.ndarray, "c 3"], Float[np.ndarray, "c 3 3"]]:
+    """Means of n sightings and one more, and the covariances of such means: (n² C + C_seen) / (n + 1)²."""
+    after = n[:, None] + 1.0
+    cov = (n[:, None, None] ** 2 * cov_mm2 + sighting_cov_mm2) / after[:, :, None] ** 2
+    return xyz_mm + (sighting_mm - xyz_mm) / after, cov
 
 
 def world_covariance(
