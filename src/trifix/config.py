@@ -23,6 +23,7 @@ from trifix.files.tables import read_text
 from trifix.stages.detect import DetectOptions
 from trifix.stages.identify import IdentifyOptions
 from trifix.stages.match import MatchOptions
+from trifix.stages.predict import PredictOptions
 from trifix.stages.update import UpdateOptions
 from trifix.stages.verify import VerifyOptions
 from trifix.stages.weigh import NoiseOptions
@@ -50,6 +51,8 @@ class Config:
     """How noisy the recording is taken to be."""
     identify: IdentifyOptions = field(default_factory=IdentifyOptions)
     """Where to look for the target that a point is."""
+    predict: PredictOptions = field(default_factory=PredictOptions)
+    """How the sensor may move between frames."""
     verify: VerifyOptions = field(default_factory=VerifyOptions)
     """When a pose is believed."""
     update: UpdateOptions = field(default_factory=UpdateOptions)

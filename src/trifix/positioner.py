@@ -22,6 +22,7 @@ from trifix.records import (
     NoFix,
     Orientations,
     PositionedReason,
+    Prediction,
     Reason,
     ReferenceMap,
     SensorPoints,
@@ -35,6 +36,7 @@ from trifix.stages.detect import detect
 from trifix.stages.identify import identifier
 from trifix.stages.match import match
 from trifix.stages.orient import orient
+from trifix.stages.predict import Motion, follow, predict
 from trifix.stages.triangulate import triangulate
 from trifix.stages.update import found_map, update
 from trifix.stages.verify import verify
@@ -62,7 +64,7 @@ class Positioner:
         self._is_noise_stated = is_noise_stated
         self._next_id = int(self.map.id.max(initial=-1)) + 1
         self._last_ns = -(1 << 63)
-        self._last_pose: Pose | None = None
+        self._motion: Motion | None = None
         self._identifier = identifier(self.config.identify)
         self._identifier.learn(self.map, np.zeros(0, dtype=np.int64))
         self._cameras = ThreadPoolExecutor(2, thread_name_prefix="camera")
@@ -135,7 +137,9 @@ class Positioner:
         if len(self.map) == 0:
             return None, _define_world(points)
         best, tried = NoFix(Reason.no_candidate), 0
-        portions = self._identifier.identify(points, self.map, self._last_pose)
+        prediction = predict(self._motion, frame.timestamp_ns, self.config.predict)
+        last_pose = self._motion.newest if self._motion else None
+        portions = self._identifier.identify(points, self.map, last_pose)
         identification = None
         while best.why in (Reason.no_candidate, Reason.not_proven, Reason.residual):
             with clock("identify"):
@@ -143,15 +147,15 @@ class Positioner:
             if portion is None:
                 break
             identification = portion
-            tried += len(identification)
             with clock("orient"):
                 orientations = orient(points, self.map, identification)
             with clock("verify"):
-                fix = self._verify(points, matches, identification, orientations, tried)
+                fix = self._verify(points, matches, identification, orientations, tried, prediction)
             if isinstance(fix, Fix):
                 return identification, fix
             if fix.why is not Reason.no_candidate:
                 best = fix
+            tried += len(identification)
         return identification, best
 
     def _verify(
@@ -160,13 +164,14 @@ class Positioner:
         matches: StereoMatches | None,
         identification: Identification,
         orientations: Orientations,
-        tried: int,
+        tried: float,
+        prediction: Prediction | None,
     ) -> Fix | NoFix:
         """Poses to the one that is proven, by the method that the options name."""
         options = self.config.verify
         match options.method:
             case "probability":
-                return verify(points, self.map, identification, orientations, matches, tried, options)
+                return verify(points, self.map, identification, orientations, matches, tried, prediction, options)
             case "residual":
                 return verify_residual(points, self.map, orientations, options.counterpart_mm, options.max_residual_mm)
             case _:
@@ -184,7 +189,7 @@ class Positioner:
         none = np.zeros(0, dtype=np.int64)
         if points is None or isinstance(fix, NoFix):
             return none
-        self._last_pose = fix.T_world_sensor
+        self._motion = follow(self._motion, frame.timestamp_ns, fix.T_world_sensor)
         if matches is None:
             self.noise = weigh_residuals(self.noise, points, self.map, fix, self._is_noise_stated, self.config.noise)
         elif fix.reason is not PositionedReason.defines_world:

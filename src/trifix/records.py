@@ -266,6 +266,8 @@ class Identification:
     """Row of the target."""
     comparisons: int = 0
     """Comparisons of triangles or distances that were made to find them."""
+    expected_by_chance: float = float("inf")
+    """Hypotheses that chance alone would have brought, by the technique's own estimate; infinite where it has none."""
 
     def __len__(self) -> int:
         return len(self.point)
@@ -283,6 +285,16 @@ class Orientations:
     """Covariances of δ = (translation mm, rotation rad), T · exp(δ)."""
     is_valid: Bool[np.ndarray, "h"]
     """False where the pairs lie on one line and determine no pose."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Prediction:
+    """Where the sensor should be if it moved on as it did."""
+
+    T_world_sensor: Pose
+    """The pose."""
+    cov: Float[np.ndarray, "6 6"]
+    """Covariance of δ = (translation mm, rotation rad), T_true = T · exp(δ)."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

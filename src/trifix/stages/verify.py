@@ -6,7 +6,7 @@ mean is at most one for a wrong pose, so that by Markov's inequality its inverse
 bounds the probability of accepting a wrong one. The three points that made the hypothesis are no evidence.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
@@ -21,6 +21,7 @@ from trifix.records import (
     Identification,
     NoFix,
     Orientations,
+    Prediction,
     Reason,
     ReferenceMap,
     Rival,
@@ -83,6 +84,7 @@ class Solution:
 
 
 _QUICK_NEIGHBOURS = 12  # of each of the three points, for the first look
+_CARRIED_OFF = 1e-3  # ε: probability that the sensor is not where its motion leads
 _SURROUNDING = 5  # neighbours of a target that tell how targets lie around it
 
 
@@ -92,7 +94,8 @@ def verify(
     identification: Identification,
     orientations: Orientations,
     matches: StereoMatches | None = None,
-    tried: int | None = None,
+    tried: float = 0.0,
+    prediction: Prediction | None = None,
     options: VerifyOptions = VerifyOptions(),
 ) -> Fix | NoFix:
     """The one pose that the frame proves, or why there is none.
@@ -106,9 +109,14 @@ def verify(
         return NoFix(Reason.no_candidate)
     spread, spacing_mm = surroundings(map)
     solutions = solve(points, map, identification, orientations, matches, spread, options)
+    if prediction is not None:
+        area_mm2 = float((spacing_mm**2).sum())
+        gain = [motion_log_ratio(s.T_world_sensor, prediction, area_mm2) for s in solutions]
+        solutions = [replace(s, log_ratio=s.log_ratio + g) for s, g in zip(solutions, gain, strict=True)]
+        solutions.sort(key=lambda s: -s.log_ratio)
     if not solutions:
         return NoFix(Reason.no_candidate, "Every hypothesis looks at targets from behind or has its points on a line.")
-    return judge(solutions, points, map, spacing_mm, tried or len(identification), options)
+    return judge(solutions, points, map, spacing_mm, tried + false_hypotheses(identification, solutions[0]), options)
 
 
 def solve(
@@ -196,7 +204,7 @@ def judge(
     points: SensorPoints,
     map: ReferenceMap,
     spacing_mm: Float[np.ndarray, "k"],
-    tried: int,
+    tried: float,
     options: VerifyOptions,
 ) -> Fix | NoFix:
     """Accepts the best solution if it is proven, without rival and firmly held."""
@@ -233,6 +241,35 @@ def judge(
         residual_mm=residual_mm,
         p_chance=p_chance,
     )
+
+
+def false_hypotheses(identification: Identification, best: Solution) -> float:
+    """How many false hypotheses must be reckoned with: each is one more chance for chance.
+
+    Those that do not belong to the best solution are false if it is right, and tell how many there are if it is wrong.
+    Where they are few, what the technique expects of chance stands in for them, if that is less than all.
+    """
+    target_of = np.full(int(identification.point.max()) + 1, -1)
+    known = best.point[best.point < len(target_of)]
+    target_of[known] = best.target[: len(known)]
+    others = int((target_of[identification.point] != identification.target).any(axis=1).sum())
+    return min(max(others, identification.expected_by_chance), len(identification))
+
+
+def motion_log_ratio(T_world_sensor: Pose, prediction: Prediction, area_mm2: float) -> float:
+    """ln of the likelihood of a pose if the sensor moved on as predicted, against any pose that the map admits.
+
+    A wrong pose lays the frame's points on the surface of the targets somewhere else: anywhere on its area, turned by
+    any angle. Only these three degrees of freedom count. A sensor can be carried off unseen: with probability ε it may
+    be anywhere, so that the prediction can hold against a pose by that much and no more.
+    """
+    delta = (prediction.T_world_sensor.inverse() @ T_world_sensor).log()
+    sigma = np.sqrt(np.diag(prediction.cov))
+    d2 = float(delta @ np.linalg.solve(prediction.cov, delta))
+    peak = 2 * np.pi * area_mm2 / ((2 * np.pi) ** 1.5 * sigma[0] * sigma[1] * sigma[5])
+    if peak <= 1:
+        return 0.0  # the prediction says less than the map
+    return float(np.log((1 - _CARRIED_OFF) * peak * np.exp(-0.5 * d2) + _CARRIED_OFF))
 
 
 def pose_sigma(cov: Float[np.ndarray, "6 6"], xyz_mm: Float[np.ndarray, "c 3"]) -> tuple[float, float]:

@@ -52,6 +52,7 @@ class IdentifyOptions:
 
 NO_TRIANGLES = np.zeros((0, 3), dtype=np.int64)
 FORMED_AT_MOST = 2_000_000  # pairs of triangles held in memory before the likeliest are kept
+_SAMPLE = 60  # triangles of either side from which chance is judged
 _ALL_TRIANGLES_UP_TO = 40  # points: 9880 triangles
 _CORNERS = 8  # points of a set of pairs among which its widest triangles are sought
 _WIDEST = 10
@@ -119,7 +120,32 @@ def congruent_triangles(
             FORMED_AT_MOST,
         )
         likeliest = np.argsort(by_length[row], kind="stable")[: options.max_hypotheses]
-        yield Identification(point[likeliest], target[likeliest], len(frame_triangles) * len(portion))
+        yield Identification(
+            point[likeliest],
+            target[likeliest],
+            comparisons=len(frame_triangles) * len(portion),
+            expected_by_chance=_expected_by_chance(frame[1:3], (side, var), options),
+        )
+
+
+def _expected_by_chance(
+    frame: tuple[np.ndarray, np.ndarray], map_: tuple[np.ndarray, np.ndarray], options: IdentifyOptions
+) -> float:
+    """How many pairs of triangles would agree if those of frame and map had nothing to do with one another.
+
+    Each of a sample of pairs is moved at random by a normal step many tolerances wide, along each of its three sides:
+    the probability that it then agrees, summed, and scaled to all pairs.
+    """
+    (frame_side, frame_var), (map_side, map_var) = (
+        (side[:: len(side) // _SAMPLE + 1], var[:: len(side) // _SAMPLE + 1]) for side, var in (frame, map_)
+    )
+    if len(frame_side) == 0 or len(map_side) == 0:
+        return 0.0
+    tolerance = options.tolerance_mm + options.max_sigmas * np.sqrt(frame_var[:, None] + map_var[None])
+    step_mm = np.maximum(0.2 * np.median(frame_side), 3 * tolerance)
+    apart = (frame_side[:, None] - map_side[None]) / step_mm
+    chance = np.minimum(2 * tolerance / (np.sqrt(2 * np.pi) * step_mm) * np.exp(-0.5 * apart**2), 1.0).prod(axis=2)
+    return float(chance.mean()) * len(frame[0]) * len(map_[0])
 
 
 def widest_triangles(
