@@ -7,6 +7,7 @@ and adds one. Minimal and frequency triangles learn it as they always do; beside
 everything anew takes, for frequency triangles from the same counts. Delaunay triangles are always formed anew.
 """
 
+from functools import partial
 from time import perf_counter
 
 import numpy as np
@@ -57,11 +58,11 @@ def measured(n: int, frames: int) -> list[tuple[str, float | None, float, int]]:
         seen = np.append(window(map, place)[:-1], len(map) - 1)
         map.xyz_mm[seen] += rng.normal(scale=0.02, size=(len(seen), 3))
         for name, work in {
-            "minimal": lambda: minimal.learn(map, seen),
-            "minimal anew": lambda: all_minimal(map),
-            "frequency": lambda: frequency.learn(map, seen),
-            "frequency anew": lambda: all_frequency(frequency),
-            "delaunay anew": lambda: delaunay.learn(map, seen),
+            "minimal": partial(minimal.learn, map, seen),
+            "minimal anew": partial(all_minimal, map),
+            "frequency": partial(frequency.learn, map, seen),
+            "frequency anew": partial(all_frequency, frequency),
+            "delaunay anew": partial(delaunay.learn, map, seen),
         }.items():
             start = perf_counter()
             work()
