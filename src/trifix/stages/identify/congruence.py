@@ -124,11 +124,11 @@ def congruent_triangles(
             point[likeliest],
             target[likeliest],
             comparisons=len(frame_triangles) * len(portion),
-            expected_by_chance=_expected_by_chance(frame[1:3], (side, var), options),
+            expected_by_chance=expected_by_chance(frame[1:3], (side, var), options),
         )
 
 
-def _expected_by_chance(
+def expected_by_chance(
     frame: tuple[np.ndarray, np.ndarray], map_: tuple[np.ndarray, np.ndarray], options: IdentifyOptions
 ) -> float:
     """How many pairs of triangles would agree if those of frame and map had nothing to do with one another.

@@ -21,6 +21,7 @@ from trifix.stages.identify.congruence import (
     all_frame_triangles,
     describe_frame,
     describe_map,
+    expected_by_chance,
 )
 from trifix.stages.identify.triangles import map_triangles
 
@@ -40,8 +41,9 @@ class HashedTriangles:
         self, points: SensorPoints, map: ReferenceMap, prediction: Pose | None = None
     ) -> Iterator[Identification]:
         """Pairs of congruent triangles in one portion, in no order; the comparisons are those really made."""
+        frame = describe_frame(points, all_frame_triangles(points, self._options))
         point, target, _, comparisons = matching.match_hashed(
-            *describe_frame(points, all_frame_triangles(points, self._options)),
+            *frame,
             *self._described,
             *self._table,
             self._cell_mm,
@@ -50,7 +52,8 @@ class HashedTriangles:
             FORMED_AT_MOST,
         )
         kept = slice(self._options.max_hypotheses)
-        yield Identification(point[kept], target[kept], int(comparisons))
+        chance = expected_by_chance(frame[1:3], self._described[1:3], self._options)
+        yield Identification(point[kept], target[kept], int(comparisons), chance)
 
     def learn(self, map: ReferenceMap, seen: Int[np.ndarray, "s"]) -> None:
         """Builds the table anew if the map has changed."""
