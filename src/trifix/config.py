@@ -22,6 +22,7 @@ from trifix.errors import ConfigError
 from trifix.files.tables import read_text
 from trifix.stages.detect import DetectOptions
 from trifix.stages.identify import IdentifyOptions
+from trifix.stages.identify.congruence import Technique
 from trifix.stages.match import MatchOptions
 from trifix.stages.predict import PredictOptions
 from trifix.stages.update import UpdateOptions
@@ -71,6 +72,26 @@ def read_config(path: Path) -> Config:
     except tomllib.TOMLDecodeError as error:
         raise ConfigError(f"{path}: is not TOML ({error}); `trifix config` prints one to start from.") from error
     return with_values(Config(), values, source=str(path))
+
+
+def paper_options(technique: Technique = "frequency") -> Config:
+    """The options under which frames are judged as in the paper (Khoury 2006), by one of its techniques.
+
+    One tolerance for all lengths, three standard deviations of the scenes' measured sides; verification by residuals
+    alone, over all hypotheses at once; every point stays in the list.
+    """
+    return Config(
+        identify=IdentifyOptions(
+            technique=technique,
+            frame_triangles="all",
+            max_sigmas=0.0,
+            tolerance_mm=1.0,
+            portion=1_000_000_000,
+            max_hypotheses=1_000_000,
+        ),
+        verify=VerifyOptions(method="residual"),
+        update=UpdateOptions(method="kalman", max_misses=0),
+    )
 
 
 def with_overrides(config: Config, overrides: Mapping[str, str]) -> Config:
