@@ -39,6 +39,7 @@ def _is_setting(_: object, settings: tuple[str, ...]) -> None:
 
 
 Level = Literal["images", "dots", "points"]
+Technique = Literal["frequency", "minimal", "delaunay", "triangles", "hashing", "distances", "icp"]
 Out = Annotated[Path, Parameter(name=["--out", "-o"])]
 Settings = Annotated[tuple[str, ...], Parameter(name="--set", validator=_is_setting, show_default=False)]
 
@@ -54,6 +55,7 @@ def run(
     map_: Annotated[Path | None, Parameter(name="--map")] = None,
     map_mode: Literal["frozen", "grow"] = "grow",
     polarity: Literal["auto", "dark", "bright"] | None = None,
+    identify: Technique | None = None,
     frame_triangles: Literal["auto", "all", "local"] | None = None,
     sigma_px: float | None = None,
     config: Path | None = None,
@@ -69,6 +71,7 @@ def run(
         map_: CSV file of targets known beforehand; its coordinates become the world's.
         map_mode: Leave the given map as it is, or let it grow.
         polarity: Brightness of the targets against what surrounds them.
+        identify: Technique by which points are matched to the map.
         frame_triangles: Look at all triangles of a frame, or at those between neighbours.
         sigma_px: Standard deviation of a dot's centre to start from, where the recording states none (px); 0.3 unless
             an option says otherwise.
@@ -80,7 +83,12 @@ def run(
     options = _options(
         config,
         settings,
-        {"detect.polarity": polarity, "identify.frame_triangles": frame_triangles, "noise.sigma_px": sigma_px},
+        {
+            "detect.polarity": polarity,
+            "identify.technique": identify,
+            "identify.frame_triangles": frame_triangles,
+            "noise.sigma_px": sigma_px,
+        },
     )
     given = None if map_ is None else trifix.read_map(map_)
     frames = trifix.read_recording(recording, level, options.noise.sigma_px)
