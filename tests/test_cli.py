@@ -100,7 +100,7 @@ def test_help_and_usage_errors_load_no_numerics(arguments: list[str], code: int)
             '"video" for --from. Choose from: "images", "dots", "points".',
         ),
         (["run", "here", "-o", "out", "--sigma-px", "small"], 'unable to convert "small" into float.'),
-        (["run", "here", "-o", "out", "--map-mode", "frozen"], "--map-mode frozen keeps a given map as it is: name it"),
+        (["run", "here", "-o", "out", "--map-mode", "frozen"], "--map-mode says what becomes of a given map: name it"),
         (["run", "here", "-o", "out", "--set", "match"], '"match" has no value; write stage.key=value.'),
     ],
 )

@@ -7,7 +7,7 @@ from trifix.geometry.camera import Camera, StereoRig
 from trifix.geometry.pose import Pose
 from trifix.outputs.report import Report
 from trifix.outputs.results import ResultsWriter
-from trifix.positioner import Positioner
+from trifix.positioner import Positioner, Positions, position
 from trifix.records import (
     Dots,
     Fix,
@@ -39,6 +39,7 @@ __all__ = [
     "NoFix",
     "Pose",
     "Positioner",
+    "Positions",
     "Reason",
     "Recording",
     "ReferenceMap",
@@ -56,6 +57,7 @@ __all__ = [
     "identifier",
     "match",
     "orient",
+    "position",
     "read_config",
     "read_map",
     "read_recording",

@@ -53,7 +53,7 @@ def run(
     online: bool = False,
     level: Annotated[Level | None, Parameter(name="--from")] = None,
     map_: Annotated[Path | None, Parameter(name="--map")] = None,
-    map_mode: Literal["frozen", "grow"] = "grow",
+    map_mode: Literal["frozen", "grow"] | None = None,
     polarity: Literal["auto", "dark", "bright"] | None = None,
     identify: Technique | None = None,
     frame_triangles: Literal["auto", "all", "local"] | None = None,
@@ -69,7 +69,7 @@ def run(
         online: Judge every frame by what was known at its time, and never rewrite a row.
         level: Begin with images, dots or points; without it, with the richest that the recording holds.
         map_: CSV file of targets known beforehand; its coordinates become the world's.
-        map_mode: Leave the given map as it is, or let it grow.
+        map_mode: Leave the given map as it is (frozen, the default), or let it grow by what else stands still.
         polarity: Brightness of the targets against what surrounds them.
         identify: Technique by which points are matched to the map.
         frame_triangles: Look at all triangles of a frame, or at those between neighbours.
@@ -78,8 +78,8 @@ def run(
         config: TOML file of options; `trifix config` prints one.
         settings: An option by its full name, such as match.max_depth_mm=900; may be repeated.
     """
-    if map_ is None and map_mode == "frozen":
-        raise CycloptsError(msg="--map-mode frozen keeps a given map as it is: name it with --map.")
+    if map_ is None and map_mode is not None:
+        raise CycloptsError(msg="--map-mode says what becomes of a given map: name it with --map.")
     options = _options(
         config,
         settings,
@@ -92,7 +92,7 @@ def run(
     )
     given = None if map_ is None else trifix.read_map(map_)
     frames = trifix.read_recording(recording, level, options.noise.sigma_px)
-    _position(frames, out, options, given, is_map_frozen=map_mode == "frozen", is_online=online)
+    _position(frames, out, options, given, is_map_frozen=given is not None and map_mode != "grow", is_online=online)
 
 
 @app.command(sort_key=1)
@@ -224,7 +224,7 @@ def _position(
     from trifix.config import to_toml
     from trifix.outputs.terminal import summary_table
 
-    positioner = trifix.Positioner(options, given, is_map_frozen, recording.is_noise_stated)
+    positioner = trifix.Positioner(options, given, is_map_frozen)
     report = trifix.Report()
     with (
         trifix.ResultsWriter(out, recording.path.name, recording.level, to_toml(options), is_online) as results,

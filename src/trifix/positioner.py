@@ -6,13 +6,17 @@ It does not know where frames come from nor who is watching.
 from collections.abc import Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
+from dataclasses import dataclass
 from functools import partial
+from pathlib import Path
 from time import perf_counter
 from typing import assert_never
 
 import numpy as np
+from jaxtyping import Int
 
 from trifix.config import Config
+from trifix.files.recordings import Recording, read_recording
 from trifix.geometry.alignment import spread_off_line_mm
 from trifix.geometry.pose import Pose
 from trifix.records import (
@@ -70,7 +74,9 @@ class Positioner:
         self._cameras = ThreadPoolExecutor(2, thread_name_prefix="camera")
 
     def run(self, frames: Iterable[Frame]) -> Iterator[Step]:
-        """A Step for every frame, in order."""
+        """A Step for every frame, in order, as soon as it is judged."""
+        if isinstance(frames, Recording):
+            self._is_noise_stated = frames.is_noise_stated
         for frame in frames:
             yield self.step(frame)
 
@@ -214,6 +220,40 @@ class Positioner:
         self.noise = weigh_matches(
             self.noise, matches, options.match.max_epipolar_sigmas, self._is_noise_stated, options.noise
         )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Positions:
+    """A whole recording, positioned."""
+
+    frame: Int[np.ndarray, "n"]
+    """Numbers of the frames."""
+    timestamp_ns: Int[np.ndarray, "n"]
+    """Their times (ns)."""
+    fixes: tuple[Fix | NoFix, ...]
+    """The answer for each of them."""
+    map: ReferenceMap
+    """The targets, as known in the end."""
+    noise_scale: float
+    """Factor on all standard deviations that the recording turned out to need."""
+
+
+def position(
+    recording: Recording | Path | str,
+    config: Config | None = None,
+    map: ReferenceMap | None = None,
+    is_map_frozen: bool = False,
+) -> Positions:
+    """Every frame of a recording positioned, in one call.
+
+    Raises:
+        TrifixError: the recording cannot be read.
+    """
+    positioner = Positioner(config, map, is_map_frozen)
+    if not isinstance(recording, Recording):
+        recording = read_recording(Path(recording), sigma_px=positioner.config.noise.sigma_px)
+    fixes = tuple(step.fix for step in positioner.run(recording))
+    return Positions(recording.index, recording.timestamp_ns, fixes, positioner.map.copy(), positioner.noise.scale)
 
 
 class Stopwatch:
