@@ -182,3 +182,9 @@ def test_distances_resolve_the_contradictions_of_strangers_in_the_frame() -> Non
     assert len(found) >= 4
     assert (row_in_map[target[found.point]] == found.target).all()
     assert found.comparisons == len(points) * (len(points) - 1) // 2 * (56 * 55 // 2)
+
+
+def test_the_command_line_offers_every_technique() -> None:
+    from trifix import cli
+
+    assert get_args(cli.Technique) == TECHNIQUES
