@@ -7,7 +7,8 @@ in one sentence on stderr. Exit codes: 0 complete, 1 bad input, 2 usage, 130 int
 import os
 import signal
 import sys
-from contextlib import ExitStack
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -161,6 +162,9 @@ def warmup() -> None:
             import_module(name).warm_up()
 
 
+_INTERRUPTED = "interrupted; what was finished until then is whole."
+
+
 def main() -> None:
     """Run the command line and leave with its exit code."""
     signal.signal(signal.SIGTERM, signal.default_int_handler)  # as ctrl-C: finished results stay whole
@@ -177,7 +181,11 @@ def main() -> None:
     except OSError as error:
         _leave(f"{error.filename}: {error.strerror}." if error.filename else f"{error}.", 1)
     except KeyboardInterrupt:
-        _leave("interrupted; what was finished until then is whole.", 130)
+        _leave(_INTERRUPTED, 130)
+    except SystemError as error:  # what an interrupt inside compiled code looks like
+        if not isinstance(error.__cause__, KeyboardInterrupt):
+            raise
+        _leave(_INTERRUPTED, 130)
 
 
 def _leave(sentence: str, code: int) -> None:
@@ -230,12 +238,36 @@ def _position(
         trifix.ResultsWriter(out, recording.path.name, recording.level, to_toml(options), is_online) as results,
         _progress() as progress,
     ):
-        for step in progress.track(positioner.run(recording), len(recording), description="positioning"):
-            results.write(step)
-            report.show(step)
+        with _between_frames() as stop_if_told:
+            for step in progress.track(positioner.run(recording), len(recording), description="positioning"):
+                results.write(step)
+                report.show(step)
+                stop_if_told()
         summary = results.finish()
     report.write(out / "report.html", summary)
     Console().print(summary_table(summary, out / "report.html"))
+
+
+@contextmanager
+def _between_frames() -> Iterator[Callable[[], None]]:
+    """Lets an interrupt wait for the end of a frame, as compiled code does not survive one; a second does not wait."""
+    told: list[int] = []
+
+    def note(number: int, frame: object) -> None:
+        told.append(number)
+        if len(told) > 1:
+            raise KeyboardInterrupt
+
+    def stop_if_told() -> None:
+        if told:
+            raise KeyboardInterrupt
+
+    before = {number: signal.signal(number, note) for number in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        yield stop_if_told
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
 
 
 def _print_rows(rows: list[tuple[str, str]]) -> None:
