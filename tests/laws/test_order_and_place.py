@@ -41,7 +41,10 @@ def said(step: Step, order: Sequence[np.ndarray] | None) -> dict[tuple[int, ...]
     if not isinstance(step.fix, Fix):
         return {}
     p = step.fix.point
-    rows = [p] if step.matches is None else [step.matches.left[step.points.match[p]], step.matches.right[step.points.match[p]]]
+    rows = [p]
+    if step.matches is not None:
+        pair = step.points.match[p]
+        rows = [step.matches.left[pair], step.matches.right[pair]]
     if order is not None:
         rows = [one[row] for one, row in zip(order, rows, strict=True)]
     keys = zip(*(row.tolist() for row in rows), strict=True)
