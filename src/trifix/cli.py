@@ -5,6 +5,7 @@ in one sentence on stderr. Exit codes: 0 complete, 1 bad input, 2 usage, 130 int
 """
 
 import os
+import shlex
 import signal
 import sys
 from collections.abc import Callable, Iterator
@@ -14,7 +15,16 @@ from typing import Annotated, Literal
 
 from cyclopts import App, CycloptsError, Parameter
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, ProgressColumn, Task, TextColumn, TimeRemainingColumn
+from rich.progress import (
+    BarColumn,
+    MofNCompleteColumn,
+    Progress,
+    ProgressColumn,
+    Task,
+    TaskID,
+    TextColumn,
+    TimeRemainingColumn,
+)
 from rich.table import Table
 from rich.text import Text
 
@@ -42,6 +52,7 @@ def _is_setting(_: object, settings: tuple[str, ...]) -> None:
 Level = Literal["images", "dots", "points"]
 Technique = Literal["frequency", "minimal", "delaunay", "triangles", "hashing", "distances", "icp"]
 Out = Annotated[Path, Parameter(name=["--out", "-o"])]
+Names = Annotated[tuple[str, ...], Parameter(consume_multiple=True, show_default=False)]
 Settings = Annotated[tuple[str, ...], Parameter(name="--set", validator=_is_setting, show_default=False)]
 
 
@@ -56,7 +67,10 @@ def run(
     map_: Annotated[Path | None, Parameter(name="--map")] = None,
     map_mode: Literal["frozen", "grow"] | None = None,
     polarity: Literal["auto", "dark", "bright"] | None = None,
+    paper: bool = False,
     identify: Technique | None = None,
+    verify: Literal["probability", "residual"] | None = None,
+    update: Literal["kalman", "mean"] | None = None,
     frame_triangles: Literal["auto", "all", "local"] | None = None,
     sigma_px: float | None = None,
     config: Path | None = None,
@@ -72,7 +86,11 @@ def run(
         map_: CSV file of targets known beforehand; its coordinates become the world's.
         map_mode: Leave the given map as it is (frozen, the default), or let it grow by what else stands still.
         polarity: Brightness of the targets against what surrounds them.
+        paper: Judge frames as in the paper: by one tolerance and residuals alone, online; begin with its options
+            instead of a file's.
         identify: Technique by which points are matched to the map.
+        verify: Believe a pose that cannot be chance, or whose residuals are small.
+        update: Average a target's sightings by their covariances, or all alike.
         frame_triangles: Look at all triangles of a frame, or at those between neighbours.
         sigma_px: Standard deviation of a dot's centre to start from, where the recording states none (px); 0.3 unless
             an option says otherwise.
@@ -81,6 +99,8 @@ def run(
     """
     if map_ is None and map_mode is not None:
         raise CycloptsError(msg="--map-mode says what becomes of a given map: name it with --map.")
+    if paper and config is not None:
+        raise CycloptsError(msg="--paper begins with the paper's options and --config with a file's: choose one.")
     options = _options(
         config,
         settings,
@@ -89,11 +109,16 @@ def run(
             "identify.technique": identify,
             "identify.frame_triangles": frame_triangles,
             "noise.sigma_px": sigma_px,
+            "verify.method": verify,
+            "update.method": update,
         },
+        is_paper=paper,
     )
     given = None if map_ is None else trifix.read_map(map_)
     frames = trifix.read_recording(recording, level, options.noise.sigma_px)
-    _position(frames, out, options, given, is_map_frozen=given is not None and map_mode != "grow", is_online=online)
+    _position(
+        frames, out, options, given, is_map_frozen=given is not None and map_mode != "grow", is_online=online or paper
+    )
 
 
 @app.command(sort_key=1)
@@ -135,7 +160,52 @@ def evaluate(results: Path, truth: Path, /) -> None:
     _print_rows(table(trifix.evaluate(results, truth)))
 
 
-@app.command(sort_key=4)
+experiment = App(name="experiment", help="Repeat the paper's experiments on simulated recordings.", sort_key=4)
+app.command(experiment)
+
+
+@experiment.command
+def paper(
+    *,
+    out: Out,
+    scenes: Names = (),
+    techniques: Names = (),
+    frames: int | None = None,
+    seed: int = 0,
+    workers: int = 2,
+) -> None:
+    """Try every technique of the paper on its scenes, and show what comes out beside the paper's numbers.
+
+    What is finished is kept: after an interrupt, the same command goes on where it was.
+
+    Args:
+        out: Folder for the page, its figures and tables, and the parts of which they are made.
+        scenes: Names of scenes; without any, the paper's five.
+        techniques: Names of techniques; without any, all of them.
+        frames: Number of frames of each scene; without it, the scene's own.
+        seed: Another seed makes other recordings of the same scenes.
+        workers: Processes to work side by side.
+    """
+    from trifix.experiments.page import claims_table, write_experiment
+    from trifix.experiments.paper import SCENES, TECHNIQUES, run_paper
+
+    with ExitStack() as bars:
+        progress = _progress()
+        tasks: dict[str, TaskID] = {}
+
+        def show(part: str, done: int, of: int) -> None:
+            if not progress.live.is_started:
+                bars.enter_context(progress)
+            if part not in tasks:
+                tasks[part] = progress.add_task(part, total=of)
+            progress.update(tasks[part], completed=done, visible=done < of)
+
+        parts = run_paper(out, scenes or SCENES, techniques or TECHNIQUES, frames, seed, show, workers)
+    page = write_experiment(parts, out, shlex.join(["trifix", *sys.argv[1:]]))
+    Console().print(claims_table(parts, page))
+
+
+@app.command(sort_key=5)
 def config(*, config: Path | None = None, settings: Settings = ()) -> None:
     """Print the options in effect, each with its meaning, as TOML.
 
@@ -148,7 +218,7 @@ def config(*, config: Path | None = None, settings: Settings = ()) -> None:
     print(to_toml(_options(config, settings)), end="")
 
 
-@app.command(sort_key=5)
+@app.command(sort_key=6)
 def warmup() -> None:
     """Compile the inner loops, once for this machine, so that the first frame need not wait for it."""
     import pkgutil
@@ -194,16 +264,20 @@ def _leave(sentence: str, code: int) -> None:
 
 
 def _options(
-    file: Path | None, settings: tuple[str, ...], shorthands: dict[str, object] | None = None
+    file: Path | None,
+    settings: tuple[str, ...],
+    shorthands: dict[str, object] | None = None,
+    is_paper: bool = False,
 ) -> "trifix.Config":
-    """The options of a file, or the defaults, with what was said on the command line in their place."""
-    from trifix.config import with_overrides
+    """The options of a file, the paper's or the defaults, with what was said on the command line in their place."""
+    from trifix.config import paper_options, with_overrides
 
     given = {key: str(value) for key, value in (shorthands or {}).items() if value is not None}
     for each in settings:
         key, value = each.split("=", 1)
         given[key.strip()] = value.strip()
-    return with_overrides(trifix.read_config(file) if file else trifix.Config(), given)
+    start = paper_options() if is_paper else trifix.read_config(file) if file else trifix.Config()
+    return with_overrides(start, given)
 
 
 def _simulate(scene: str, out: Path, level: Level, seed: int = 0, frames: int | None = None) -> None:
