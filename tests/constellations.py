@@ -124,7 +124,8 @@ def firm_triple(xyz_mm: np.ndarray) -> list[int]:
 def saying(*pairs: Sequence[tuple[int, int]]) -> Identification:
     """Hypotheses, each as its pairs of (point, target)."""
     table = np.array(pairs, dtype=np.int64).reshape(len(pairs), -1, 2)
-    return Identification(table[:, :, 0], table[:, :, 1])
+    point, target = np.ascontiguousarray(table.transpose(2, 0, 1))
+    return Identification(point, target)
 
 
 def fixed(fix: Fix | NoFix) -> Fix:

@@ -1,4 +1,4 @@
-"""Real recordings against their truth: no wrong pose, and most frames positioned, within the limits of their READMEs."""
+"""Real recordings against their truth, by the limits of their READMEs: no wrong pose, and most frames positioned."""
 
 from collections.abc import Callable
 from itertools import islice

@@ -38,7 +38,7 @@ def pairs_of_a_frame(rng: np.random.Generator, true_scale: float, noise: NoiseSc
     return StereoMatches(zero, zero, 0.2 * z, np.full(len(z), 0.2))
 
 
-def found_among(true_scale: float, false_share: float, seed: int, is_stated: bool = False, frames: int = 40) -> float:
+def found_among(true_scale: float, false_share: float, seed: int, is_stated: bool = False, frames: int = 30) -> float:
     rng, noise = np.random.default_rng(seed), NoiseScale()
     for _ in range(frames):
         noise = weigh_matches(noise, pairs_of_a_frame(rng, true_scale, noise, false_share), GATE, is_stated, OPTIONS)
@@ -48,7 +48,7 @@ def found_among(true_scale: float, false_share: float, seed: int, is_stated: boo
 @pytest.mark.parametrize("true_scale", [0.2, 0.5, 1.0, 1.5])
 @pytest.mark.parametrize("false_share", [0.0, 0.3, 0.7])
 def test_the_scale_is_found_among_false_pairs(true_scale: float, false_share: float):
-    found = np.array([found_among(true_scale, false_share, seed) for seed in range(3)])
+    found = np.array([found_among(true_scale, false_share, seed) for seed in range(2)])
     assert np.abs(found / true_scale - 1).max() < 0.15
     assert abs(found.mean() / true_scale - 1) < 0.10
 
