@@ -10,6 +10,7 @@ import signal
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -313,10 +314,21 @@ def _position(
         _progress() as progress,
     ):
         with _between_frames() as stop_if_told:
+            judged = []
             for step in progress.track(positioner.run(recording), len(recording), description="positioning"):
                 results.write(step)
-                report.show(step)
                 stop_if_told()
+                if is_online:
+                    report.show(step)
+                else:
+                    judged.append(step.remembered())
+            if not is_online:
+                results.start_over()
+                again = zip(recording, positioner.revise(judged), strict=True)
+                for frame, step in progress.track(again, len(recording), description="revising"):
+                    results.write(step)
+                    report.show(replace(step, frame=frame))  # with its images
+                    stop_if_told()
         summary = results.finish()
     report.write(out / "report.html", summary)
     Console().print(summary_table(summary, out / "report.html"))

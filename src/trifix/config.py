@@ -41,6 +41,20 @@ Options = TypeVar("Options", bound=Dataclass)
 
 
 @dataclass(frozen=True, slots=True)
+class IslandOptions:
+    """What becomes of frames that nothing connects to the map."""
+
+    max_islands: int = 6
+    """Maps beside the world's to keep at most, those of most frames; 0 for none."""
+    min_points: int = 4
+    """Points that a frame must have to found one."""
+
+    def __post_init__(self) -> None:
+        if self.max_islands < 0 or self.min_points < 3:
+            raise ConfigError("islands.max_islands must be at least 0 and islands.min_points at least 3.")
+
+
+@dataclass(frozen=True, slots=True)
 class Config:
     """Every stage's options, in the order of the work."""
 
@@ -58,6 +72,8 @@ class Config:
     """When a pose is believed."""
     update: UpdateOptions = field(default_factory=UpdateOptions)
     """How the map grows."""
+    islands: IslandOptions = field(default_factory=IslandOptions)
+    """What becomes of frames that nothing connects to the map."""
 
 
 def read_config(path: Path) -> Config:
@@ -91,6 +107,7 @@ def paper_options(technique: Technique = "frequency") -> Config:
         ),
         verify=VerifyOptions(method="residual"),
         update=UpdateOptions(method="kalman", max_misses=0),
+        islands=IslandOptions(max_islands=0),
     )
 
 

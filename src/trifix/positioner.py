@@ -3,13 +3,11 @@
 It does not know where frames come from nor who is watching.
 """
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from time import perf_counter
 from typing import assert_never
 
 import numpy as np
@@ -19,14 +17,15 @@ from trifix.config import Config
 from trifix.files.recordings import Recording, read_recording
 from trifix.geometry.alignment import spread_off_line_mm
 from trifix.geometry.pose import Pose
+from trifix.island import NOTHING, Island, Stopwatch
 from trifix.records import (
+    Elsewhere,
+    Event,
     Fix,
     Frame,
     Identification,
     NoFix,
-    Orientations,
     PositionedReason,
-    Prediction,
     Reason,
     ReferenceMap,
     SensorPoints,
@@ -37,15 +36,11 @@ from trifix.records import (
     Unusable,
 )
 from trifix.stages.detect import detect
-from trifix.stages.identify import identifier
 from trifix.stages.match import match
-from trifix.stages.orient import orient
-from trifix.stages.predict import Motion, follow, predict
 from trifix.stages.triangulate import triangulate
-from trifix.stages.update import found_map, update
-from trifix.stages.verify import verify
-from trifix.stages.verify_residual import verify_residual
 from trifix.stages.weigh import NoiseScale, add_prior_noise, scale_points, weigh_matches, weigh_residuals
+
+_COULD_BE_ELSEWHERE = (Reason.no_candidate, Reason.not_proven)
 
 
 class Positioner:
@@ -62,16 +57,21 @@ class Positioner:
         is_noise_stated: bool = False,
     ) -> None:
         self.config = config or Config()
-        self.map = map or ReferenceMap.empty()
         self.noise = NoiseScale()
-        self._is_map_frozen = is_map_frozen
         self._is_noise_stated = is_noise_stated
+        self._world = Island(0, self.config, map or ReferenceMap.empty(), is_map_frozen)
         self._next_id = int(self.map.id.max(initial=-1)) + 1
         self._last_ns = -(1 << 63)
-        self._motion: Motion | None = None
-        self._identifier = identifier(self.config.identify)
-        self._identifier.learn(self.map, np.zeros(0, dtype=np.int64))
+        self._islands: list[Island] = []
+        self._founded = 0
+        self._joined: set[int] = set()
+        self._is_map_given = map is not None
         self._cameras = ThreadPoolExecutor(2, thread_name_prefix="camera")
+
+    @property
+    def map(self) -> ReferenceMap:
+        """The world's targets as they are known now; copy it to keep it."""
+        return self._world.map
 
     def run(self, frames: Iterable[Frame]) -> Iterator[Step]:
         """A Step for every frame, in order, as soon as it is judged."""
@@ -82,14 +82,35 @@ class Positioner:
 
     def step(self, frame: Frame) -> Step:
         """Judges one frame, and lets the map grow by it if it is positioned."""
-        clock = Stopwatch()
         if frame.timestamp_ns < self._last_ns:
             frame = _reversed(frame, self._last_ns)
         self._last_ns = max(self._last_ns, frame.timestamp_ns)
+        return self._judge(frame, learns=True)
 
+    def _judge(self, frame: Frame, learns: bool) -> Step:
+        """The loop's body: sense, position, learn."""
+        clock, events, added = Stopwatch(), list[Event](), NOTHING
         dots, matches, points = self._sense(frame, clock)
-        identification, fix = self._position(frame, points, matches, clock)
-        added = self._learn(frame, points, matches, fix, clock)
+        island, identification, fix = self._position(frame, points, matches, clock)
+        there: Fix | None = fix if isinstance(fix, Fix) else None
+        if learns and points is not None:
+            if there is not None and island is not None:
+                added = self._learn(frame, points, matches, island, there, clock)
+            elif self._may_found(points, fix):
+                island, there = self._found_island(frame, points)
+                events.append(Event("island_founded", None, f"island {island.number}, {len(points)} targets"))
+            if there is not None and island is not None and (island is not self._world or len(added)):
+                events += self._join_islands(frame, island, there, clock)
+                if island.is_absorbed:  # the island has just become part of the world
+                    island = self._world
+                    identification, fix = island.position(points, matches, frame.timestamp_ns, clock)
+        elif there is not None and island is not None:
+            island.follow(frame.timestamp_ns, there)
+        elsewhere = None
+        if island is not None and island is not self._world and there is not None:
+            elsewhere, added = Elsewhere(island.number, there, island.map), NOTHING
+            if isinstance(fix, Fix):
+                fix = NoFix(Reason.other_island, f"It is on island {island.number}, of {len(island.map)} targets.")
         return Step(
             frame=frame,
             dots=dots,
@@ -100,11 +121,13 @@ class Positioner:
             added=added,
             map=self.map,
             noise_scale=self.noise.scale,
+            events=tuple(events),
             timings_ms=clock.ms,
+            elsewhere=elsewhere,
         )
 
     def _sense(
-        self, frame: Frame, clock: "Stopwatch"
+        self, frame: Frame, clock: Stopwatch
     ) -> tuple[StereoDots | None, StereoMatches | None, SensorPoints | None]:
         """Images to dots to pairs to points; each level of a recording enters at its own stage."""
         options = self.config
@@ -132,87 +155,87 @@ class Positioner:
                 assert_never(content)
 
     def _position(
-        self, frame: Frame, points: SensorPoints | None, matches: StereoMatches | None, clock: "Stopwatch"
-    ) -> tuple[Identification | None, Fix | NoFix]:
-        """Points to hypotheses to poses to the one that is proven."""
+        self, frame: Frame, points: SensorPoints | None, matches: StereoMatches | None, clock: Stopwatch
+    ) -> tuple[Island | None, Identification | None, Fix | NoFix]:
+        """Where the frame was seen from: in the world, or else on the newest island that proves it."""
         if points is None:
             assert isinstance(frame.content, Unusable)
-            return None, NoFix(frame.content.reason, frame.content.detail)
+            return None, None, NoFix(frame.content.reason, frame.content.detail)
         if len(points) < 3:
-            return None, NoFix(Reason.too_few_points, f"{len(points)} points.")
+            return None, None, NoFix(Reason.too_few_points, f"{len(points)} points.")
         if len(self.map) == 0:
-            return None, _define_world(points)
-        best, tried = NoFix(Reason.no_candidate), 0
-        prediction = predict(self._motion, frame.timestamp_ns, self.config.predict)
-        last_pose = self._motion.newest if self._motion else None
-        portions = self._identifier.identify(points, self.map, last_pose)
-        identification = None
-        while best.why in (Reason.no_candidate, Reason.not_proven, Reason.residual):
-            with clock("identify"):
-                portion = next(portions, None)
-            if portion is None:
-                break
-            identification = portion
-            with clock("orient"):
-                orientations = orient(points, self.map, identification)
-            with clock("verify"):
-                fix = self._verify(points, matches, identification, orientations, tried, prediction)
-            if isinstance(fix, Fix):
-                return identification, fix
-            if fix.why is not Reason.no_candidate:
-                best = fix
-            tried += len(identification)
-        return identification, best
-
-    def _verify(
-        self,
-        points: SensorPoints,
-        matches: StereoMatches | None,
-        identification: Identification,
-        orientations: Orientations,
-        tried: float,
-        prediction: Prediction | None,
-    ) -> Fix | NoFix:
-        """Poses to the one that is proven, by the method that the options name."""
-        options = self.config.verify
-        match options.method:
-            case "probability":
-                return verify(points, self.map, identification, orientations, matches, tried, prediction, options)
-            case "residual":
-                return verify_residual(points, self.map, orientations, options.counterpart_mm, options.max_residual_mm)
-            case _:
-                assert_never(options.method)
+            fix = _define_world(points)
+            return (self._world if isinstance(fix, Fix) else None), None, fix
+        identification, fix = self._world.position(points, matches, frame.timestamp_ns, clock)
+        if isinstance(fix, Fix):
+            return self._world, identification, fix
+        if fix.why in _COULD_BE_ELSEWHERE:
+            for island in reversed(self._islands):
+                there, elsewhere = island.position(points, matches, frame.timestamp_ns, clock)
+                if isinstance(elsewhere, Fix):
+                    return island, there, elsewhere
+        return None, identification, fix
 
     def _learn(
         self,
         frame: Frame,
-        points: SensorPoints | None,
+        points: SensorPoints,
         matches: StereoMatches | None,
-        fix: Fix | NoFix,
-        clock: "Stopwatch",
+        island: Island,
+        fix: Fix,
+        clock: Stopwatch,
     ) -> np.ndarray:
         """A fix to a better map; returns the rows of the targets that are new."""
-        none = np.zeros(0, dtype=np.int64)
-        if points is None or isinstance(fix, NoFix):
-            return none
-        self._motion = follow(self._motion, frame.timestamp_ns, fix.T_world_sensor)
         if matches is None:
-            self.noise = weigh_residuals(self.noise, points, self.map, fix, self._is_noise_stated, self.config.noise)
+            self.noise = weigh_residuals(self.noise, points, island.map, fix, self._is_noise_stated, self.config.noise)
         elif fix.reason is not PositionedReason.defines_world:
             self._weigh(matches.rows(points.match[fix.point]))
-        if self._is_map_frozen:
-            self._identifier.learn(self.map, fix.target)
-            return none
         with clock("update"):
-            if fix.reason is PositionedReason.defines_world:
-                self.map, added = found_map(points, frame.index)
-            else:
-                self.map, added = update(
-                    self.map, points, matches, fix, frame.index, frame.rig, self._next_id, self.config.update
-                )
+            added = island.learn(frame, points, matches, fix, self._next_id)
             self._next_id += len(added)
-            self._identifier.learn(self.map, np.unique(np.concatenate([fix.target, added])))
         return added
+
+    def _may_found(self, points: SensorPoints, fix: Fix | NoFix) -> bool:
+        """Whether a frame could belong to a part of the object that no map knows yet."""
+        options = self.config.islands
+        return (
+            isinstance(fix, NoFix)
+            and fix.why in _COULD_BE_ELSEWHERE
+            and options.max_islands > 0
+            and len(points) >= options.min_points
+            and isinstance(_define_world(points), Fix)
+        )
+
+    def _found_island(self, frame: Frame, points: SensorPoints) -> tuple[Island, Fix | None]:
+        """A new map that begins with this frame; the smallest of the others makes room."""
+        if len(self._islands) == self.config.islands.max_islands:
+            self._islands.remove(min(self._islands, key=lambda island: island.frames))
+        self._founded += 1
+        island, first = Island(self._founded, self.config, ReferenceMap.empty()), _define_world(points)
+        assert isinstance(first, Fix), "asked before"
+        self._next_id += len(island.learn(frame, points, None, first, self._next_id))
+        self._islands.append(island)
+        return island, first
+
+    def _join_islands(self, frame: Frame, island: Island, fix: Fix, clock: Stopwatch) -> list[Event]:
+        """Islands become part of the world as soon as common targets prove where they lie."""
+        events: list[Event] = []
+        for other in [island] if island is not self._world else list(self._islands):
+            there: Fix | None = fix
+            if island is self._world:  # from where would the island see what the world shows this frame?
+                there = other.bridge(self._world, fix.T_world_sensor, clock)
+            if there is None:
+                continue
+            bridge = self._world.bridge(other, there.T_world_sensor, clock)
+            if bridge is None:
+                continue
+            new = self._world.absorb(other, there.T_world_sensor, bridge, frame, self._next_id)
+            self._next_id += new
+            self._islands.remove(other)
+            self._joined.add(other.number)
+            common = len(bridge.point)
+            events.append(Event("island_joined", None, f"island {other.number}, {common} common targets, {new} new"))
+        return events
 
     def _weigh(self, matches: StereoMatches) -> None:
         """Epipolar residuals to the recording's noise: those of identified points, or all before anything is known."""
@@ -220,6 +243,61 @@ class Positioner:
         self.noise = weigh_matches(
             self.noise, matches, options.match.max_epipolar_sigmas, self._is_noise_stated, options.noise
         )
+
+    def revise(self, steps: Sequence[Step]) -> Iterator[Step]:
+        """Every frame again, by all that has become known since: what a recording allows and a live run does not.
+
+        ``steps`` are those of the run, in order; ``Step.remembered`` is enough of each. Frames without a place are
+        tried again backwards and forwards, and teach the map; then every frame is judged by the finished map. The
+        island of most frames is the world, unless a map was given.
+        """
+        self._choose_world()
+        placed = {k for k, step in enumerate(steps) if self._is_in_world(step)}
+        fixes = {k: known for k in placed if (known := self._fix_in_world(steps[k])) is not None}
+        for backwards in (True, False):
+            self._world.rest()
+            for k in sorted(range(len(steps)), reverse=backwards):
+                frame = steps[k].frame
+                if backwards:  # time runs backwards, and so does the motion
+                    frame = replace(frame, timestamp_ns=-frame.timestamp_ns)
+                if k in fixes:
+                    self._world.follow(frame.timestamp_ns, fixes[k])
+                elif k not in placed:
+                    fix = self._judge(frame, learns=True).fix
+                    if isinstance(fix, Fix):
+                        placed.add(k)
+                        fixes[k] = fix
+        self._world.rest()
+        for k, before in enumerate(steps):
+            step = self._judge(before.frame, learns=False)
+            earlier = fixes.get(k)
+            if earlier is not None and (
+                isinstance(step.fix, NoFix) or earlier.reason is PositionedReason.defines_world
+            ):
+                step = replace(step, fix=earlier, elsewhere=None)
+            stages = before.timings_ms | step.timings_ms
+            both = {s: before.timings_ms.get(s, 0.0) + step.timings_ms.get(s, 0.0) for s in stages}
+            yield replace(step, events=before.events, timings_ms=both)
+
+    def _choose_world(self) -> None:
+        """The island of most frames is the world of a recording, unless a map was given."""
+        largest = max(self._islands, key=lambda island: island.frames, default=self._world)
+        if not self._is_map_given and largest.frames > self._world.frames:
+            self._islands[self._islands.index(largest)] = self._world
+            self._world = largest
+
+    def _is_in_world(self, step: Step) -> bool:
+        """Whether the world's map has learnt from this frame, be it as an island that has joined since."""
+        number = 0 if step.elsewhere is None else step.elsewhere.island
+        if number in self._joined:
+            number = 0
+        return number == self._world.number and (isinstance(step.fix, Fix) or step.elsewhere is not None)
+
+    def _fix_in_world(self, step: Step) -> Fix | None:
+        """The step's pose, where it is one in the world."""
+        if step.elsewhere is None:
+            return step.fix if isinstance(step.fix, Fix) and self._world.number == 0 else None
+        return step.elsewhere.fix if step.elsewhere.island == self._world.number else None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -244,7 +322,7 @@ def position(
     map: ReferenceMap | None = None,
     is_map_frozen: bool = False,
 ) -> Positions:
-    """Every frame of a recording positioned, in one call.
+    """Every frame of a recording positioned by all that the whole recording tells, in one call.
 
     Raises:
         TrifixError: the recording cannot be read.
@@ -252,22 +330,9 @@ def position(
     positioner = Positioner(config, map, is_map_frozen)
     if not isinstance(recording, Recording):
         recording = read_recording(Path(recording), sigma_px=positioner.config.noise.sigma_px)
-    fixes = tuple(step.fix for step in positioner.run(recording))
+    steps = [step.remembered() for step in positioner.run(recording)]
+    fixes = tuple(step.fix for step in positioner.revise(steps))
     return Positions(recording.index, recording.timestamp_ns, fixes, positioner.map.copy(), positioner.noise.scale)
-
-
-class Stopwatch:
-    """Milliseconds per stage."""
-
-    def __init__(self) -> None:
-        self.ms: dict[str, float] = {}
-
-    @contextmanager
-    def __call__(self, stage: str) -> Iterator[None]:
-        """Times what happens inside."""
-        start = perf_counter()
-        yield
-        self.ms[stage] = self.ms.get(stage, 0.0) + 1e3 * (perf_counter() - start)
 
 
 def _define_world(points: SensorPoints) -> Fix | NoFix:

@@ -4,7 +4,7 @@ Arrays are read-only by agreement. A later record names rows of an earlier one b
 the way. Units are in the names; coordinates are ``sensor`` (left camera: x right, y down, z forward) or ``world``.
 """
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from enum import Enum, IntEnum
 
 import numpy as np
@@ -367,6 +367,18 @@ class Event:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class Elsewhere:
+    """Where a frame stands that is not in the world: on an island, a map that nothing connects to it yet."""
+
+    island: int
+    """Number of the island, from 1."""
+    fix: Fix
+    """The pose in the island's own coordinates."""
+    map: ReferenceMap
+    """The island's targets after this frame."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class Step:
     """All that is known about one frame once it has been judged. Who watches, watches Steps."""
 
@@ -392,3 +404,18 @@ class Step:
     """What happened to the map."""
     timings_ms: dict[str, float] = field(default_factory=dict)
     """Milliseconds per stage."""
+    elsewhere: Elsewhere | None = None
+    """Where the frame stands if it is on an island."""
+
+    def remembered(self) -> "Step":
+        """The same without what is large: images, hypotheses and maps."""
+        nothing = ReferenceMap.empty()
+        return replace(
+            self,
+            frame=self.frame if self.dots is None else replace(self.frame, content=self.dots),
+            matches=None,
+            points=None,
+            identification=None,
+            map=nothing,
+            elsewhere=None if self.elsewhere is None else replace(self.elsewhere, map=nothing),
+        )

@@ -1,13 +1,18 @@
 """The results folder, written as Steps pass and usable whenever the process dies. Decides nothing, draws nothing.
 
+A recording may be gone through twice. What the first passage gave stands until the second, written beside it in a
+hidden folder, is whole and takes its place.
+
 Rows wait in memory for a quarter of a second at most; then a thread appends them to their files in blocks of whole
 lines, one write a file, so that a slow frame holds no row back. ``frames.csv`` comes last in each round: the rows of
 the frames that it names stand in all other files already. Map and summary are replaced, never rewritten in place.
 Nothing depends on the clock but timings.csv and summary.json.
 """
 
+import shutil
 import threading
 import time
+from functools import partial
 from itertools import chain
 from pathlib import Path
 from types import TracebackType
@@ -30,6 +35,8 @@ FLUSH_S = 0.25
 CHECKPOINT_S = 5.0
 """Longest wait of a changed map in memory (s)."""
 
+_ISLANDS = "islands"
+_REVISED = ".revised"
 _POSE = "x_mm,y_mm,z_mm,qx,qy,qz,qw"
 # In the order in which they are written.
 _HEADERS = {
@@ -50,6 +57,9 @@ class ResultsWriter:
     with ResultsWriter(out, "my recording", "dots", to_toml(config), is_online=True) as results:
         for step in positioner.run(recording):
             results.write(step)
+        results.start_over()                        # not for a live run
+        for step in positioner.revise(steps):
+            results.write(step)
         summary = results.finish()
 
     Without ``finish``, as after an exception, the files are closed whole and the summary says ``finished: false``.
@@ -58,13 +68,17 @@ class ResultsWriter:
     def __init__(self, out: Path, recording_name: str, level: Level, config_toml: str, is_online: bool) -> None:
         self._out = out
         self._level = level
-        self._tally = Tally(recording_name, level, config_toml, is_online)
+        self._new_tally = partial(Tally, recording_name, level, config_toml, is_online)
+        self._tally = self._new_tally()
         self._map = ReferenceMap.empty()
+        self._island_maps: dict[int, ReferenceMap] = {}
         self._dots_written = 0
         self._waiting: list[dict[str, list[str]]] = []
         self._is_finished = False
         self._failure: OSError | None = None
         self._lock = threading.Lock()  # held for moments: between the loop, which fills, and the thread, which empties
+        self._files = threading.Lock()  # held while files are written or exchanged
+        self._folder = out  # where rows go: the results folder, or the hidden one of a second passage
         self._closing = threading.Event()
         self._thread = threading.Thread(target=self._keep_writing, name="results", daemon=True)
 
@@ -80,11 +94,9 @@ class ResultsWriter:
             self._write_state()  # first of all: from here on the summary says that the run is not finished
             for name in (*_HEADERS, "report.html"):
                 (self._out / name).unlink(missing_ok=True)
-            self._logs = {
-                name: _Log(self._out / name, header)
-                for name, header in _HEADERS.items()
-                if name != "dots.csv" or self._level == "images"
-            }
+            for name in (_ISLANDS, _REVISED):
+                shutil.rmtree(self._out / name, ignore_errors=True)
+            self._logs = self._open_logs()
         except OSError as error:
             raise RecordingError(f"{self._out}: results cannot be written there ({error.strerror}).") from error
         self._thread.start()
@@ -117,11 +129,40 @@ class ResultsWriter:
         if self._level == "images" and step.dots is not None:
             rows["dots.csv"] = dots_rows(step.frame.index, step.frame.timestamp_ns, step.dots)
             self._dots_written += len(rows["dots.csv"])
+        if step.elsewhere is not None:
+            there, folder = step.elsewhere.fix, f"{_ISLANDS}/{step.elsewhere.island}"
+            pose, timestamp_ns = there.T_world_sensor, step.frame.timestamp_ns
+            rows[f"{folder}/poses.csv"] = [poses_row(step.frame.index, timestamp_ns, pose, there.cov)]
+            rows[f"{folder}/trajectory.tum"] = [tum_row(timestamp_ns, pose)]
         targets = step.map.copy()
         with self._lock:
             self._waiting.append(rows)
             self._map = targets
+            if step.elsewhere is not None:
+                self._island_maps[step.elsewhere.island] = step.elsewhere.map
             self._tally.add(step, residual_px)
+
+    def start_over(self) -> None:
+        """Begin again with the first frame; what has been written stands until ``finish`` puts the new in its place.
+
+        Raises:
+            RecordingError: the files cannot be written.
+        """
+        self._complain()
+        try:
+            with self._files:
+                self._flush()
+                for log in self._logs.values():
+                    log.close()
+                self._folder = self._out / _REVISED
+                self._folder.mkdir()
+                self._logs = self._open_logs()
+        except OSError as error:
+            raise RecordingError(f"{self._out}: results cannot be written there ({error.strerror}).") from error
+        with self._lock:
+            self._tally = self._new_tally()
+            self._island_maps = {}
+        self._dots_written = 0
 
     def finish(self) -> Summary:
         """Close the files of a run that reached its end; what it amounts to.
@@ -151,11 +192,14 @@ class ResultsWriter:
         checkpoint = self._start
         try:
             while not self._closing.wait(FLUSH_S):
-                self._flush()
+                with self._files:
+                    self._flush()
                 if time.monotonic() - checkpoint > CHECKPOINT_S:
                     checkpoint = time.monotonic()
                     self._write_state()
             self._flush()
+            if self._is_finished:
+                self._publish()
             self._write_state()
         except OSError as error:
             self._failure = error
@@ -163,16 +207,43 @@ class ResultsWriter:
     def _flush(self) -> None:
         with self._lock:
             waiting, self._waiting = self._waiting, []
+        for name in sorted({name for rows in waiting for name in rows if name not in self._logs}):
+            path = self._folder / name  # of an island that is new
+            path.parent.mkdir(parents=True, exist_ok=True)
+            self._logs = {name: _Log(path, _HEADERS[path.name]), **self._logs}
         if waiting:
             for name, log in self._logs.items():
                 log.append("".join(f"{row}\n" for row in chain.from_iterable(rows.get(name, ()) for rows in waiting)))
 
+    def _open_logs(self) -> "dict[str, _Log]":
+        return {
+            name: _Log(self._folder / name, header)
+            for name, header in _HEADERS.items()
+            if name != "dots.csv" or self._level == "images"
+        }
+
+    def _publish(self) -> None:
+        """Put the files of a second passage in the place of the first's."""
+        for log in self._logs.values():
+            log.close()
+        if self._folder == self._out:
+            return
+        shutil.rmtree(self._out / _ISLANDS, ignore_errors=True)
+        for path in sorted(self._folder.iterdir()):
+            path.replace(self._out / path.name)
+        self._folder.rmdir()
+        self._folder = self._out
+
     def _write_state(self) -> None:
         with self._lock:
-            targets = self._map
+            targets, islands = self._map, dict(self._island_maps)
             self._summary = self._tally.summary(
                 targets, time.monotonic() - self._start, finished=self._is_finished and self._closing.is_set()
             )
+        for number, there in islands.items():
+            folder = self._folder / _ISLANDS / str(number)
+            if folder.is_dir():  # its first rows may still wait in memory
+                write_map(there, folder / "map.csv")
         write_map(targets, self._out / "map.csv")
         write_ply(targets, self._out / "map.ply")
         summary = msgspec.json.format(msgspec.json.encode(self._summary), indent=2).decode()

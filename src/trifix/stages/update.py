@@ -35,9 +35,9 @@ class UpdateOptions:
             raise ConfigError("update.trusted_after must be at least 1, max_misses and new_target_sigmas at least 0.")
 
 
-def found_map(points: SensorPoints, frame_index: int) -> tuple[ReferenceMap, np.ndarray]:
+def found_map(points: SensorPoints, frame_index: int, next_id: int = 0) -> tuple[ReferenceMap, np.ndarray]:
     """The map of the first frame, whose sensor coordinates become the world's, and the rows of its targets."""
-    return _with_points(ReferenceMap.empty(), points, np.arange(len(points)), Pose.identity(), None, frame_index, 0)
+    return _with_points(ReferenceMap.empty(), points, np.arange(len(points)), Pose.identity(), None, frame_index, next_id)
 
 
 def update(

@@ -1,0 +1,188 @@
+"""A map that grows by itself: the world is one, and so is every part of the object that nothing connects to it yet.
+
+What belongs to such a map goes with it: the memory of the matching technique and the motion of the sensor across it.
+Knows no image and no other island, but for the moment in which it absorbs one.
+"""
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+from time import perf_counter
+from typing import assert_never
+
+import numpy as np
+from jaxtyping import Int
+
+from trifix.config import Config
+from trifix.geometry.pose import Pose
+from trifix.records import (
+    Fix,
+    Frame,
+    Identification,
+    NoFix,
+    Orientations,
+    PositionedReason,
+    Prediction,
+    Reason,
+    ReferenceMap,
+    SensorPoints,
+    StereoMatches,
+)
+from trifix.stages.identify import identifier
+from trifix.stages.orient import orient
+from trifix.stages.predict import Motion, follow, predict
+from trifix.stages.update import found_map, update
+from trifix.stages.verify import verify
+from trifix.stages.verify_residual import verify_residual
+
+NOTHING = np.zeros(0, dtype=np.int64)
+
+
+class Island:
+    """One map, and everything that is remembered with it."""
+
+    def __init__(self, number: int, config: Config, map: ReferenceMap, is_frozen: bool = False) -> None:
+        self.number = number
+        self.map = map
+        self.frames = 0
+        self.is_absorbed = False
+        self.motion: Motion | None = None
+        self._config = config
+        self._is_frozen = is_frozen
+        self._identifier = identifier(config.identify)
+        self._identifier.learn(map, NOTHING)
+
+    def position(
+        self,
+        points: SensorPoints,
+        matches: StereoMatches | None,
+        timestamp_ns: int | None,
+        clock: "Stopwatch",
+    ) -> tuple[Identification | None, Fix | NoFix]:
+        """Points to hypotheses to poses to the one that is proven; without a time, no motion speaks for any."""
+        best, tried = NoFix(Reason.no_candidate), 0
+        prediction = None if timestamp_ns is None else predict(self.motion, timestamp_ns, self._config.predict)
+        last_pose = self.motion.newest if self.motion else None
+        portions = self._identifier.identify(points, self.map, last_pose)
+        identification = None
+        while best.why in (Reason.no_candidate, Reason.not_proven, Reason.residual):
+            with clock("identify"):
+                portion = next(portions, None)
+            if portion is None:
+                break
+            identification = portion
+            with clock("orient"):
+                orientations = orient(points, self.map, identification)
+            with clock("verify"):
+                fix = self._verify(points, matches, identification, orientations, tried, prediction)
+            if isinstance(fix, Fix):
+                return identification, fix
+            if fix.why is not Reason.no_candidate:
+                best = fix
+            tried += len(identification)
+        return identification, best
+
+    def learn(
+        self,
+        frame: Frame,
+        points: SensorPoints,
+        matches: StereoMatches | None,
+        fix: Fix,
+        next_id: int,
+    ) -> Int[np.ndarray, "a"]:
+        """A fix to a better map; returns the rows of the targets that are new."""
+        self.frames += 1
+        self.follow(frame.timestamp_ns, fix)
+        if self._is_frozen:
+            self._identifier.learn(self.map, fix.target)
+            return NOTHING
+        if fix.reason is PositionedReason.defines_world:
+            self.map, added = found_map(points, frame.index, next_id)
+        else:
+            self.map, added = update(
+                self.map, points, matches, fix, frame.index, frame.rig, next_id, self._config.update
+            )
+        self._identifier.learn(self.map, np.unique(np.concatenate([fix.target, added])))
+        return added
+
+    def follow(self, timestamp_ns: int, fix: Fix) -> None:
+        """Takes note of where the sensor was, for the next prediction."""
+        self.motion = follow(self.motion, timestamp_ns, fix.T_world_sensor)
+
+    def rest(self) -> None:
+        """Forgets the motion."""
+        self.motion = None
+
+    def bridge(self, other: "Island", T_other_sensor: Pose, clock: "Stopwatch") -> Fix | None:
+        """The pose here of a sensor whose pose is known there, if all that the other island shows it proves one.
+
+        The other island's targets, as the sensor would see them, are a frame like any other, but a better one. The
+        points of the fix are rows of the living targets there.
+        """
+        rows = other.facing(T_other_sensor)
+        if len(self.map) == 0 or len(rows) < 3:
+            return None
+        _, fix = self.position(other.seen_from(T_other_sensor, rows), None, None, clock)
+        if isinstance(fix, NoFix):
+            return None
+        return replace(fix, point=np.searchsorted(np.flatnonzero(other.map.alive), rows[fix.point]))
+
+    def absorb(self, other: "Island", T_other_sensor: Pose, bridge: Fix, frame: Frame, next_id: int) -> int:
+        """Takes over the other island's living targets across a bridge; returns how many of them are new here."""
+        points = other.seen_from(T_other_sensor, np.flatnonzero(other.map.alive))
+        self.map, added = update(self.map, points, None, bridge, frame.index, None, next_id, self._config.update)
+        self.frames += other.frames
+        other.is_absorbed = True
+        self._identifier.learn(self.map, np.unique(np.concatenate([bridge.target, added])))
+        return len(added)
+
+    def facing(self, T_world_sensor: Pose) -> Int[np.ndarray, "r"]:
+        """Rows of living targets that turn towards the sensor and lie before it."""
+        towards = T_world_sensor.t_mm - self.map.xyz_mm
+        cosine = (self.map.view * towards).sum(axis=1) / np.linalg.norm(towards, axis=1)
+        depth = T_world_sensor.inverse().apply(self.map.xyz_mm)[:, 2]
+        return np.flatnonzero(self.map.alive & ~(cosine < 0.5) & (depth > 0))
+
+    def seen_from(self, T_world_sensor: Pose, rows: Int[np.ndarray, "r"]) -> SensorPoints:
+        """Some targets as points in the coordinates of a sensor."""
+        R = T_world_sensor.R
+        return SensorPoints(
+            xyz_mm=T_world_sensor.inverse().apply(self.map.xyz_mm[rows]),
+            cov_mm2=R.T @ self.map.cov_mm2[rows] @ R,
+            match=np.full(len(rows), -1),
+            label=np.full(len(rows), -1),
+            row=np.arange(len(rows)),
+        )
+
+    def _verify(
+        self,
+        points: SensorPoints,
+        matches: StereoMatches | None,
+        identification: Identification,
+        orientations: Orientations,
+        tried: float,
+        prediction: Prediction | None,
+    ) -> Fix | NoFix:
+        """Poses to the one that is proven, by the method that the options name."""
+        options = self._config.verify
+        match options.method:
+            case "probability":
+                return verify(points, self.map, identification, orientations, matches, tried, prediction, options)
+            case "residual":
+                return verify_residual(points, self.map, orientations, options.counterpart_mm, options.max_residual_mm)
+            case _:
+                assert_never(options.method)
+
+
+class Stopwatch:
+    """Milliseconds per stage."""
+
+    def __init__(self) -> None:
+        self.ms: dict[str, float] = {}
+
+    @contextmanager
+    def __call__(self, stage: str) -> Iterator[None]:
+        """Times what happens inside."""
+        start = perf_counter()
+        yield
+        self.ms[stage] = self.ms.get(stage, 0.0) + 1e3 * (perf_counter() - start)
