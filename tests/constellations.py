@@ -112,13 +112,11 @@ def front_map(xyz_mm: np.ndarray, sigma_mm: float = 0.0) -> ReferenceMap:
 
 def firm_triple(xyz_mm: np.ndarray) -> list[int]:
     """Rows of the three places whose triangle has the largest smallest altitude: they hold a pose best."""
-
-    def altitude_mm(rows: tuple[int, ...]) -> float:
-        a, b, c = xyz_mm[list(rows)]
-        area = np.linalg.norm(np.cross(b - a, c - a))
-        return float(area / max(np.linalg.norm(b - a), np.linalg.norm(c - a), np.linalg.norm(c - b)))
-
-    return list(max(combinations(range(len(xyz_mm)), 3), key=altitude_mm))
+    triples = np.array(list(combinations(range(len(xyz_mm)), 3)))
+    a, b, c = xyz_mm[triples].transpose(1, 0, 2)
+    area = np.linalg.norm(np.cross(b - a, c - a), axis=1)
+    longest = np.max([np.linalg.norm(side, axis=1) for side in (b - a, c - a, c - b)], axis=0)
+    return triples[np.argmax(area / longest)].tolist()
 
 
 def saying(*pairs: Sequence[tuple[int, int]]) -> Identification:

@@ -107,10 +107,11 @@ def test_depths_beyond_the_limits_are_dropped(options, kept_mm):
     assert pairs(match(dots, PARALLEL, options)) == {(k, k) for k in range(5) if depth[k] in kept_mm}
 
 
-def test_depth_counts_before_both_cameras():
-    xyz = np.array([[50.0, 0.0, 500.0]])
+@pytest.mark.parametrize("x_mm", [-60.0, 160.0], ids=["nearer to the right one", "nearer to the left one"])
+def test_depth_counts_before_both_cameras(x_mm):
+    xyz = np.array([[x_mm, 0.0, 500.0]])
     dots = seen_dots(xyz, np.random.default_rng(7), 0.05)
-    depths = sorted((xyz[0, 2], float(RIG.T_right_left.apply(xyz)[0, 2])))
+    depths = sorted((500.0, float(RIG.T_right_left.apply(xyz)[0, 2])))
     assert depths[1] - depths[0] > 1
     between = 0.5 * sum(depths)
     assert len(match(dots, RIG, MatchOptions(min_depth_mm=between))) == 0

@@ -82,9 +82,10 @@ def test_a_dot_in_several_pairs_gives_several_points():
 def test_pairs_that_meet_behind_a_camera_or_nowhere_give_no_point():
     uv = np.array([[600.0, 500.0]])
     left = Dots.of(np.repeat(uv, 3, axis=0))
-    right = Dots.of(uv - [[300.0, 0.0], [-50.0, 0.0], [0.0, 0.0]])  # before, behind, parallel
+    right = Dots.of(uv - [[-50.0, 0.0], [0.0, 0.0], [300.0, 0.0]])  # behind, parallel, before
     points = triangulate(StereoDots(left, right), paired([0, 1, 2], [0, 1, 2]), PARALLEL)
-    np.testing.assert_array_equal(points.match, [0])
+    np.testing.assert_array_equal(points.match, [2])
+    np.testing.assert_array_equal(points.row, [0])
     np.testing.assert_allclose(points.xyz_mm[0, 2], 400.0, atol=1e-6)
     assert np.isfinite(points.cov_mm2).all()
 

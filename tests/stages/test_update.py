@@ -1,5 +1,6 @@
 """The map's growth: known targets are averaged, new ones enter, ghosts go, and nothing is renamed."""
 
+from dataclasses import replace
 from math import sqrt
 
 import numpy as np
@@ -19,7 +20,7 @@ from constellations import (
     some_points,
 )
 from trifix.errors import ConfigError
-from trifix.geometry.pose import Pose
+from trifix.geometry.pose import Pose, skew
 from trifix.records import Fix, ReferenceMap, SensorPoints, StereoMatches, TargetState
 from trifix.stages.update import UpdateOptions, found_map, update
 
@@ -139,12 +140,14 @@ def test_new_points_enter_with_the_uncertainty_of_the_pose():
     rng = np.random.default_rng(4)
     world = scattered(rng, 5)
     T = looking(rng)
-    sigma_mm, sigma_rad = 0.05, 3e-4
+    # the sensor turns about the targets rather than about itself: translation and rotation go together
+    B = np.eye(6)
+    B[:3, 3:] = skew(T.inverse().apply(np.zeros((1, 3)))[0])
+    B = B @ np.diag([0.03] * 3 + [2e-3] * 3)
     total = 0.0
     trials = 400
     for _ in range(trials):
-        T_found = T @ Pose.exp(np.concatenate([sigma_mm * rng.normal(size=3), sigma_rad * rng.normal(size=3)]))
-        fix = fix_of(T_found, [0, 1, 2], [0, 1, 2], sigma_mm, sigma_rad)
+        fix = replace(fix_of(T @ Pose.exp(B @ rng.normal(size=6)), [0, 1, 2], [0, 1, 2]), cov=B @ B.T)
         after, added = update(front_map(world[:3], 0.05), seen_points(world, T, rng), None, fix, 1, None, 100)
         np.testing.assert_array_equal(added, [3, 4])
         np.testing.assert_array_equal(after.id[added], [100, 101])

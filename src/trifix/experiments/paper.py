@@ -11,7 +11,7 @@ import os
 import shutil
 import signal
 import threading
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
@@ -19,7 +19,7 @@ from dataclasses import dataclass
 from multiprocessing.queues import SimpleQueue
 from multiprocessing.synchronize import Event
 from pathlib import Path
-from typing import Protocol, get_args
+from typing import get_args
 
 import msgspec
 
@@ -40,16 +40,12 @@ _SHOWN_EVERY = 20  # frames
 _DRAWN_BY = ("experiments/figures.py", "experiments/page.py", "cli.py", "__main__.py")  # a part does not depend on it
 
 
-class Show(Protocol):
-    """Told how far each part has come."""
-
-    def __call__(self, part: str, done: int, of: int) -> None:
-        """``done`` frames ``of`` all."""
-        ...
+Show = Callable[[str, int, int], None]
+"""Called with the name of a part, the number of its frames that are done, and the number of all."""
 
 
 @dataclass(frozen=True, slots=True)
-class _Task:
+class Task:
     """A scene to simulate, or a technique to try on it."""
 
     name: str
@@ -86,20 +82,7 @@ def run_paper(
     Raises:
         TrifixError: a name is unknown, a number impossible, or ``out`` is somebody else's.
     """
-    for name in techniques:
-        _refuse_unknown(name, TECHNIQUES)
-    chosen = [name for name in TECHNIQUES if name in techniques]
-    code = code_key()
-    simulations, measurements = [], []
-    for scene in dict.fromkeys(scenes):
-        n = recipe_of(scene).frames if frames is None else frames
-        room = out / "recordings" / scene
-        key = _key(scene, str(seed), str(n), code)
-        simulations.append(_Task(f"{scene}: simulate", key, scene, room, seed, n))
-        for technique in chosen:
-            options = paper_options(technique)
-            name, file = f"{scene}: {technique}", out / "parts" / f"{scene}-{technique}.json"
-            measurements.append(_Task(name, _key(key, to_toml(options)), scene, room, seed, n, options, file))
+    simulations, measurements = tasks(out, scenes, techniques, frames, seed)
     _make_folder(out)
     parts = {task.name: read_part(task) for task in measurements}
     missing = [task for task in measurements if parts[task.name] is None]
@@ -109,7 +92,36 @@ def run_paper(
     return [part for task in measurements if (part := parts[task.name]) is not None]
 
 
-def read_part(task: _Task) -> Part | None:
+def tasks(
+    out: Path, scenes: Sequence[str], techniques: Sequence[str], frames: int | None, seed: int
+) -> tuple[list[Task], list[Task]]:
+    """What there is to simulate and to measure, each with the key of all that it depends on.
+
+    Raises:
+        TrifixError: as ``run_paper``.
+    """
+    for name in techniques:
+        _refuse_unknown(name, TECHNIQUES)
+    if frames is not None and frames < 1:
+        raise ConfigError(f"An experiment of {frames} frames cannot be made: at least 1 is needed.")
+    if seed < 0:
+        raise ConfigError(f"The seed is {seed}: it must not be negative.")
+    code = code_key()
+    simulations, measurements = [], []
+    for scene in dict.fromkeys(scenes):
+        n = recipe_of(scene).frames if frames is None else frames
+        room = out / "recordings" / scene
+        key = _key(scene, str(seed), str(n), code)
+        simulations.append(Task(f"{scene}: simulate", key, scene, room, seed, n))
+        for technique in TECHNIQUES:
+            if technique in techniques:
+                options = paper_options(technique)
+                name, file = f"{scene}: {technique}", out / "parts" / f"{scene}-{technique}.json"
+                measurements.append(Task(name, _key(key, to_toml(options)), scene, room, seed, n, options, file))
+    return simulations, measurements
+
+
+def read_part(task: Task) -> Part | None:
     """A part that stands there whole and was made from the same; else None."""
     assert task.file is not None
     try:
@@ -158,7 +170,7 @@ def _make_folder(out: Path) -> None:
 
 
 def _measured(
-    simulations: Sequence[_Task], measurements: Sequence[_Task], show: Show, workers: int
+    simulations: Sequence[Task], measurements: Sequence[Task], show: Show, workers: int
 ) -> dict[str, Part | None]:
     """Each scene is simulated first; then its techniques, as workers come free."""
     context = multiprocessing.get_context("spawn")  # a fork would copy threads in the middle of what they do
@@ -176,7 +188,7 @@ def _measured(
     workers = max(1, min(workers, os.cpu_count() or 1, len(measurements)))
     executor = ProcessPoolExecutor(workers, context, initializer=_begin, initargs=(progress, stop))
     with _stopping(executor, stop):
-        running: dict[Future[Part | None], _Task] = {executor.submit(_simulate, task): task for task in simulations}
+        running: dict[Future[Part | None], Task] = {executor.submit(_simulate, task): task for task in simulations}
         while running:
             done, _ = wait(running, timeout=0.1, return_when=FIRST_COMPLETED)
             while not progress.empty():
@@ -230,7 +242,7 @@ def _end_with_parent() -> None:
     os._exit(1)
 
 
-def _simulate(task: _Task) -> None:
+def _simulate(task: Task) -> None:
     """In a worker: the recording of a scene, unless it is there."""
     mark = task.room / "key"
     if mark.exists() and mark.read_text(encoding="utf-8") == task.key:
@@ -240,7 +252,7 @@ def _simulate(task: _Task) -> None:
     write_atomically(mark, task.key)
 
 
-def _measure(task: _Task) -> Part:
+def _measure(task: Task) -> Part:
     """In a worker: one part, written when it is whole."""
     assert task.options is not None
     assert task.file is not None
