@@ -252,32 +252,31 @@ class Positioner:
         island of most frames is the world, unless a map was given.
         """
         self._choose_world()
-        placed = {k for k, step in enumerate(steps) if self._is_in_world(step)}
-        fixes = {k: known for k in placed if (known := self._fix_in_world(steps[k])) is not None}
+        placed = {k: step for k, step in enumerate(map(self._in_world, steps)) if step is not None}
         for backwards in (True, False):
             self._world.rest()
             for k in sorted(range(len(steps)), reverse=backwards):
                 frame = steps[k].frame
                 if backwards:  # time runs backwards, and so does the motion
                     frame = replace(frame, timestamp_ns=-frame.timestamp_ns)
-                if k in fixes:
-                    self._world.follow(frame.timestamp_ns, fixes[k])
-                elif k not in placed:
-                    fix = self._judge(frame, learns=True).fix
-                    if isinstance(fix, Fix):
-                        placed.add(k)
-                        fixes[k] = fix
+                known = placed.get(k)
+                if known is not None and isinstance(known.fix, Fix):
+                    self._world.follow(frame.timestamp_ns, known.fix)
+                    continue
+                step = self._judge(frame, learns=known is None)  # an island's frames have taught the map already
+                if isinstance(step.fix, Fix):
+                    placed[k] = step.remembered()
         self._world.rest()
         for k, before in enumerate(steps):
             step = self._judge(before.frame, learns=False)
-            earlier = fixes.get(k)
-            if earlier is not None and (
-                isinstance(step.fix, NoFix) or earlier.reason is PositionedReason.defines_world
-            ):
-                step = replace(step, fix=earlier, elsewhere=None)
-            stages = before.timings_ms | step.timings_ms
-            both = {s: before.timings_ms.get(s, 0.0) + step.timings_ms.get(s, 0.0) for s in stages}
-            yield replace(step, events=before.events, timings_ms=both)
+            earlier = placed.get(k, step)
+            is_first = isinstance(earlier.fix, Fix) and earlier.fix.reason is PositionedReason.defines_world
+            if isinstance(earlier.fix, Fix) and earlier.points and (is_first or isinstance(step.fix, NoFix)):
+                fix = earlier.fix.moved_to(earlier.map, self.map, earlier.points)
+                step = replace(earlier, fix=fix, map=self.map, elsewhere=None)
+            yield replace(
+                step, frame=before.frame, events=before.events, timings_ms=_sum(before.timings_ms, step.timings_ms)
+            )
 
     def _choose_world(self) -> None:
         """The island of most frames is the world of a recording, unless a map was given."""
@@ -286,18 +285,13 @@ class Positioner:
             self._islands[self._islands.index(largest)] = self._world
             self._world = largest
 
-    def _is_in_world(self, step: Step) -> bool:
-        """Whether the world's map has learnt from this frame, be it as an island that has joined since."""
-        number = 0 if step.elsewhere is None else step.elsewhere.island
-        if number in self._joined:
-            number = 0
-        return number == self._world.number and (isinstance(step.fix, Fix) or step.elsewhere is not None)
-
-    def _fix_in_world(self, step: Step) -> Fix | None:
-        """The step's pose, where it is one in the world."""
+    def _in_world(self, step: Step) -> Step | None:
+        """The step, if the world's map has learnt from its frame; its fix is one in the world, if that is known."""
         if step.elsewhere is None:
-            return step.fix if isinstance(step.fix, Fix) and self._world.number == 0 else None
-        return step.elsewhere.fix if step.elsewhere.island == self._world.number else None
+            return step if isinstance(step.fix, Fix) and self._world.number == 0 else None
+        if step.elsewhere.island == self._world.number:
+            return replace(step, fix=step.elsewhere.fix, map=step.elsewhere.map)
+        return step if self._world.number == 0 and step.elsewhere.island in self._joined else None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -355,3 +349,7 @@ def _reversed(frame: Frame, last_ns: int) -> Frame:
     """The same frame, refused because it is older than one already judged."""
     detail = f"It was taken at {frame.timestamp_ns} ns, after one of {last_ns} ns."
     return Frame(frame.index, frame.timestamp_ns, frame.rig, Unusable(Reason.time_reversed, detail))
+
+
+def _sum(first: dict[str, float], second: dict[str, float]) -> dict[str, float]:
+    return {stage: first.get(stage, 0.0) + second.get(stage, 0.0) for stage in first | second}

@@ -112,7 +112,7 @@ class StereoMatches:
     right: Int[np.ndarray, "m"]
     """Row of the right dot."""
     epipolar_px: Float[np.ndarray, "m"]
-    """Signed distance from the epipolar line, in pixels of the undistorted image."""
+    """Signed misfit: the epipolar constraint's residual over what an error of one pixel in every coordinate makes."""
     epipolar_sigma_px: Float[np.ndarray, "m"]
     """Its standard deviation from the dots' covariances, before the recording's noise scale."""
 
@@ -215,18 +215,22 @@ class ReferenceMap:
         """Rows that may be identified: trusted or provisional."""
         return np.asarray(self.state <= TargetState.trusted)
 
+    def rows(self, rows: Int[np.ndarray, "r"]) -> "ReferenceMap":
+        """A map of some of the targets, in the order asked for, with storage of its own."""
+        return ReferenceMap(
+            self.id[rows],
+            self.xyz_mm[rows],
+            self.cov_mm2[rows],
+            self.view[rows],
+            self.sightings[rows],
+            self.last_seen[rows],
+            self.misses[rows],
+            self.state[rows],
+        )
+
     def copy(self) -> "ReferenceMap":
         """The same map with storage of its own."""
-        return ReferenceMap(
-            self.id.copy(),
-            self.xyz_mm.copy(),
-            self.cov_mm2.copy(),
-            self.view.copy(),
-            self.sightings.copy(),
-            self.last_seen.copy(),
-            self.misses.copy(),
-            self.state.copy(),
-        )
+        return self.rows(np.arange(len(self)))
 
     @staticmethod
     def empty() -> "ReferenceMap":
@@ -318,6 +322,19 @@ class Fix:
     detail: str = ""
     """Free text."""
 
+    def with_targets_of(self, map: ReferenceMap) -> "tuple[Fix, ReferenceMap]":
+        """The same fix on a map of its own targets alone, and that map."""
+        return replace(self, target=np.arange(len(self.target))), map.rows(self.target)
+
+    def moved_to(self, targets: ReferenceMap, map: ReferenceMap, points: SensorPoints) -> "Fix":
+        """The same fix with its targets' rows in another state of the map; those that have left it are left out."""
+        alive = np.flatnonzero(map.alive)
+        row_of = dict(zip(map.id[alive].tolist(), alive.tolist(), strict=True))
+        rows = np.array([row_of.get(each, -1) for each in targets.id[self.target].tolist()], dtype=np.int64)
+        point, target = self.point[rows >= 0], rows[rows >= 0]
+        residual = map.xyz_mm[target] - self.T_world_sensor.apply(points.xyz_mm[point])
+        return replace(self, point=point, target=target, residual_mm=np.linalg.norm(residual, axis=1))
+
     @property
     def rms_mm(self) -> float:
         """Root mean square of the residuals (mm)."""
@@ -408,14 +425,19 @@ class Step:
     """Where the frame stands if it is on an island."""
 
     def remembered(self) -> "Step":
-        """The same without what is large: images, hypotheses and maps."""
-        nothing = ReferenceMap.empty()
-        return replace(
+        """The same without what is large: images, hypotheses, and of the map all but the identified targets."""
+        step = replace(
             self,
             frame=self.frame if self.dots is None else replace(self.frame, content=self.dots),
-            matches=None,
-            points=None,
             identification=None,
-            map=nothing,
-            elsewhere=None if self.elsewhere is None else replace(self.elsewhere, map=nothing),
+            added=np.zeros(0, dtype=np.int64),
         )
+        if isinstance(step.fix, Fix):
+            fix, targets = step.fix.with_targets_of(step.map)
+            step = replace(step, fix=fix, map=targets)
+        else:
+            step = replace(step, map=ReferenceMap.empty())
+        if step.elsewhere is not None:
+            fix, targets = step.elsewhere.fix.with_targets_of(step.elsewhere.map)
+            step = replace(step, elsewhere=replace(step.elsewhere, fix=fix, map=targets))
+        return step

@@ -37,7 +37,8 @@ class UpdateOptions:
 
 def found_map(points: SensorPoints, frame_index: int, next_id: int = 0) -> tuple[ReferenceMap, np.ndarray]:
     """The map of the first frame, whose sensor coordinates become the world's, and the rows of its targets."""
-    return _with_points(ReferenceMap.empty(), points, np.arange(len(points)), Pose.identity(), None, frame_index, next_id)
+    everything = np.arange(len(points))
+    return _with_points(ReferenceMap.empty(), points, everything, Pose.identity(), None, frame_index, next_id)
 
 
 def update(
