@@ -329,7 +329,7 @@ def test_run_takes_the_papers_options_and_those_said_beside_them(tmp_path: Path)
     summary = (tmp_path / "summary.json").read_text(encoding="utf-8")
     for text in ('"technique": "minimal"', '"method": "mean"', '"method": "residual"', '"is_online": true'):
         assert text in summary
-    assert '"tolerance_mm": 1.0' in summary
+    assert '"tolerance_mm": 0.4' in summary
 
 
 def test_a_file_of_options_and_the_papers_exclude_each_other(tmp_path: Path) -> None:

@@ -93,19 +93,19 @@ def read_config(path: Path) -> Config:
 def paper_options(technique: Technique = "frequency") -> Config:
     """The options under which frames are judged as in the paper (Khoury 2006), by one of its techniques.
 
-    One tolerance for all lengths, three standard deviations of the scenes' measured sides; verification by residuals
-    alone, over all hypotheses at once; every point stays in the list.
+    One tolerance for all lengths, which 99.7 % of the true sides keep in the simulated scenes, and one threshold for
+    all residuals; verification by them alone, over all hypotheses at once; every point stays in the list.
     """
     return Config(
         identify=IdentifyOptions(
             technique=technique,
             frame_triangles="all",
             max_sigmas=0.0,
-            tolerance_mm=1.0,
+            tolerance_mm=0.4,
             portion=1_000_000_000,
             max_hypotheses=1_000_000,
         ),
-        verify=VerifyOptions(method="residual"),
+        verify=VerifyOptions(method="residual", max_residual_mm=0.5),
         update=UpdateOptions(method="kalman", max_misses=0),
         islands=IslandOptions(max_islands=0),
     )

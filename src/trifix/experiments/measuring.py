@@ -138,12 +138,15 @@ DRAWN_AT_MOST = 2000
 """More triangles than this are not kept for a figure."""
 
 
-def measure(key: str, scene: str, room: Path, options: Config, show: Show) -> Part:
-    """Positions ``room/recording`` by what was known at each frame, and compares with ``room/truth``."""
+def measure(key: str, scene: str, room: Path, scratch: Path, options: Config, show: Show) -> Part:
+    """Positions ``room/recording`` by what was known at each frame, and compares with ``room/truth``.
+
+    The results are evaluated in ``scratch`` and not kept.
+    """
     recording = read_recording(room / "recording", "dots", options.noise.sigma_px)
     positioner = Positioner(options)
     watch = Watch(options.identify)
-    with TemporaryDirectory(prefix="trifix-") as folder:
+    with TemporaryDirectory(dir=scratch) as folder:
         results = Path(folder)
         with ResultsWriter(results, scene, "dots", to_toml(options), is_online=True) as writer:
             for done, step in enumerate(positioner.run(recording), start=1):

@@ -14,11 +14,12 @@ import threading
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from dataclasses import dataclass
+from multiprocessing.connection import Connection
 from multiprocessing.queues import SimpleQueue
-from multiprocessing.synchronize import Event
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import get_args
 
 import msgspec
@@ -175,7 +176,7 @@ def _measured(
     """Each scene is simulated first; then its techniques, as workers come free."""
     context = multiprocessing.get_context("spawn")  # a fork would copy threads in the middle of what they do
     progress: SimpleQueue[tuple[str, int, int]] = context.SimpleQueue()
-    stop = context.Event()
+    last_word, silence = context.Pipe(duplex=False)
     parts: dict[str, Part | None] = {}
     done_of = dict.fromkeys((task.name for task in (*simulations, *measurements)), 0)
     total = sum(task.frames for task in (*simulations, *measurements))
@@ -186,8 +187,12 @@ def _measured(
         show(part, done, of)
 
     workers = max(1, min(workers, os.cpu_count() or 1, len(measurements)))
-    executor = ProcessPoolExecutor(workers, context, initializer=_begin, initargs=(progress, stop))
-    with _stopping(executor, stop):
+    with (
+        TemporaryDirectory(prefix="trifix-") as scratch,
+        closing(silence),
+        ProcessPoolExecutor(workers, context, initializer=_begin, initargs=(progress, last_word, scratch)) as executor,
+        _ending_at_once(executor, silence),
+    ):
         running: dict[Future[Part | None], Task] = {executor.submit(_simulate, task): task for task in simulations}
         while running:
             done, _ = wait(running, timeout=0.1, return_when=FIRST_COMPLETED)
@@ -213,32 +218,27 @@ def _measured(
 
 
 @contextmanager
-def _stopping(executor: ProcessPoolExecutor, stop: Event) -> Iterator[None]:
-    """Ends the workers whatever happens, those in the middle of a part at their next frame."""
+def _ending_at_once(executor: ProcessPoolExecutor, silence: Connection) -> Iterator[None]:
+    """Ends the workers where they stand if all goes wrong: what they write gets its name when it is whole."""
     try:
         yield
-    finally:
-        stop.set()
+    except BaseException:
+        silence.close()
         executor.shutdown(cancel_futures=True)
+        raise
 
 
-class _Stopped(Exception):  # noqa: N818  (a request, not an error)
-    """The part is not wanted any more."""
+def _begin(progress: "SimpleQueue[tuple[str, int, int]]", last_word: Connection, scratch: str) -> None:
+    """Readies a worker process: where it reports and writes what it need not keep. It outlives no parent."""
+    global _progress, _scratch
+    _progress, _scratch = progress, Path(scratch)
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent tells
+    threading.Thread(target=_end_with_parent, args=(last_word,), daemon=True).start()
 
 
-def _begin(progress: "SimpleQueue[tuple[str, int, int]]", stop: Event) -> None:
-    """Readies a worker process: what it reports goes there, and only ``stop`` interrupts it."""
-    global _progress, _stop
-    _progress, _stop = progress, stop
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-    threading.Thread(target=_end_with_parent, daemon=True).start()
-
-
-def _end_with_parent() -> None:
-    """Lets no worker outlive a parent that was killed."""
-    parent = multiprocessing.parent_process()
-    assert parent is not None
-    parent.join()
+def _end_with_parent(last_word: Connection) -> None:
+    """Ends this process when the other end of the pipe is closed, by the parent or by its death."""
+    last_word.poll(None)
     os._exit(1)
 
 
@@ -256,23 +256,21 @@ def _measure(task: Task) -> Part:
     """In a worker: one part, written when it is whole."""
     assert task.options is not None
     assert task.file is not None
-    part = measure(task.key, task.scene, task.room, task.options, _Reporter(task.name))
+    part = measure(task.key, task.scene, task.room, _scratch, task.options, _Reporter(task.name))
     write_atomically(task.file, msgspec.json.encode(part).decode())
     return part
 
 
 class _Reporter:
-    """Reports how far a task has come, and ends it where it is not wanted any more."""
+    """Reports how far a task has come."""
 
     def __init__(self, name: str) -> None:
         self._name = name
 
     def __call__(self, done: int, of: int) -> None:
-        if _stop.is_set():
-            raise _Stopped
         if done < of and done % _SHOWN_EVERY == 0:
             _progress.put((self._name, done, of))
 
 
 _progress: "SimpleQueue[tuple[str, int, int]]"
-_stop: Event
+_scratch: Path
