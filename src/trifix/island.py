@@ -49,8 +49,8 @@ class Island:
         self.motion: Motion | None = None
         self._config = config
         self._is_frozen = is_frozen
-        self._identifier = identifier(config.identify)
-        self._identifier.learn(map, NOTHING)
+        self.identifier = identifier(config.identify)
+        self.identifier.learn(map, NOTHING)
 
     def position(
         self,
@@ -63,7 +63,7 @@ class Island:
         best, tried = NoFix(Reason.no_candidate), 0
         prediction = None if timestamp_ns is None else predict(self.motion, timestamp_ns, self._config.predict)
         last_pose = self.motion.newest if self.motion else None
-        portions = self._identifier.identify(points, self.map, last_pose)
+        portions = self.identifier.identify(points, self.map, last_pose)
         identification = None
         while best.why in (Reason.no_candidate, Reason.not_proven, Reason.residual):
             with clock("identify"):
@@ -94,7 +94,7 @@ class Island:
         self.frames += 1
         self.follow(frame.timestamp_ns, fix)
         if self._is_frozen:
-            self._identifier.learn(self.map, fix.target)
+            self.identifier.learn(self.map, fix.target)
             return NOTHING
         if fix.reason is PositionedReason.defines_world:
             self.map, added = found_map(points, frame.index, next_id)
@@ -102,7 +102,7 @@ class Island:
             self.map, added = update(
                 self.map, points, matches, fix, frame.index, frame.rig, next_id, self._config.update
             )
-        self._identifier.learn(self.map, np.unique(np.concatenate([fix.target, added])))
+        self.identifier.learn(self.map, np.unique(np.concatenate([fix.target, added])))
         return added
 
     def follow(self, timestamp_ns: int, fix: Fix) -> None:
@@ -133,7 +133,7 @@ class Island:
         self.map, added = update(self.map, points, None, bridge, frame.index, None, next_id, self._config.update)
         self.frames += other.frames
         other.is_absorbed = True
-        self._identifier.learn(self.map, np.unique(np.concatenate([bridge.target, added])))
+        self.identifier.learn(self.map, np.unique(np.concatenate([bridge.target, added])))
         return len(added)
 
     def facing(self, T_world_sensor: Pose) -> Int[np.ndarray, "r"]:

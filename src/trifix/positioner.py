@@ -36,6 +36,7 @@ from trifix.records import (
     Unusable,
 )
 from trifix.stages.detect import detect
+from trifix.stages.identify import Identifier
 from trifix.stages.match import match
 from trifix.stages.triangulate import triangulate
 from trifix.stages.weigh import NoiseScale, add_prior_noise, scale_points, weigh_matches, weigh_residuals
@@ -72,6 +73,11 @@ class Positioner:
     def map(self) -> ReferenceMap:
         """The world's targets as they are known now; copy it to keep it."""
         return self._world.map
+
+    @property
+    def identifier(self) -> Identifier:
+        """The matching technique, with its memory of the world."""
+        return self._world.identifier
 
     def run(self, frames: Iterable[Frame]) -> Iterator[Step]:
         """A Step for every frame, in order, as soon as it is judged."""

@@ -119,7 +119,7 @@ def test_about_two_triangles_form_per_target(technique: Technique) -> None:
     positioner = Positioner(with_overrides(Config(), {"identify.technique": technique}), is_noise_stated=True)
     for _ in positioner.run(frame for frame, _ in around_sphere(sphere(100, rng), 100, 0.065, rng)):
         pass
-    made = knowing(technique, positioner.map) if technique != "frequency" else positioner._identifier
+    made = knowing(technique, positioner.map) if technique != "frequency" else positioner.identifier
     per_target = made.size / int(positioner.map.alive.sum())
     assert positioner.map.alive.sum() > 60
     assert 1.6 < per_target < 3.0
