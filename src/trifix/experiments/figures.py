@@ -279,7 +279,7 @@ def path_figure(part: Part) -> Figure:
     size = high - low
     with mpl.rc_context(_STYLE):  # type: ignore[arg-type]
         tallest = max(size[upwards], size[away]) / size[across]
-        figure = Figure(figsize=(11, float(np.clip(4.55 * tallest, 2.2, 6.5)) + 1.15), layout="constrained")
+        figure = Figure(figsize=(11, float(np.clip(4.55 * tallest, 2.2, 6.5)) + 1.35), layout="constrained")
         for axes, row, title in zip(
             figure.subplots(1, 2), (upwards, away), ("from the front", "from above"), strict=True
         ):
