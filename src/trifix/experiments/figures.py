@@ -17,7 +17,7 @@ from matplotlib.collections import PolyCollection
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
-from trifix.experiments.measuring import Part, growth
+from trifix.experiments.measuring import Part, growth, slope
 from trifix.records import ReferenceMap
 from trifix.stages.identify.congruence import IdentifyOptions
 from trifix.stages.identify.delaunay import DelaunayTriangles
@@ -161,13 +161,23 @@ def growth_figure(parts: Sequence[Part]) -> Figure:
                     continue
                 most = max(most, int(count.max()))
                 colour, line = _LINES[part.technique]
-                for axes in (above, below):
-                    axes.plot(count, size, line, color=colour, linewidth=1.8, label=part.technique)
+                steepness = slope(part.targets, part.sizes)
+                grows_evenly = steepness is not None and size.max() < 10 * count.max()
+                above.plot(count, size, line, color=colour, linewidth=1.8, label=part.technique)
+                below.plot(
+                    count,
+                    size,
+                    line,
+                    color=colour,
+                    linewidth=1.8,
+                    label=f"{part.technique}: {steepness:.2f} per target" if grows_evenly else "_",
+                )
             above.set(title=f"{scene}: triangles or distances in the list", yscale="log")
             below.set(title="the same, close up", ylim=(0, max(100, 2.6 * most)), xlabel="targets in the list")
             below.set_xlim(0, 1.04 * most)
             below.xaxis.set_major_locator(MaxNLocator(8, integer=True))
-            above.plot([], [])  # a log axis without lines would complain
+            if below.get_legend_handles_labels()[0]:
+                below.legend(loc="upper left", frameon=True, facecolor=_PAGE, framealpha=0.9, edgecolor="none")
         handles, labels = panels[0, 0].get_legend_handles_labels()
         if handles:
             figure.legend(handles, labels, loc="outside lower center", ncols=len(handles))
@@ -269,7 +279,7 @@ def path_figure(part: Part) -> Figure:
     size = high - low
     with mpl.rc_context(_STYLE):  # type: ignore[arg-type]
         tallest = max(size[upwards], size[away]) / size[across]
-        figure = Figure(figsize=(11, float(np.clip(5.1 * tallest, 2.2, 6.5)) + 1.1), layout="constrained")
+        figure = Figure(figsize=(11, float(np.clip(4.55 * tallest, 2.2, 6.5)) + 1.35), layout="constrained")
         for axes, row, title in zip(
             figure.subplots(1, 2), (upwards, away), ("from the front", "from above"), strict=True
         ):

@@ -249,7 +249,7 @@ def _environment() -> Environment:
         lstrip_blocks=True,
     )
     environment.filters["number"] = lambda value: (
-        "–" if value is None else _thousands(value) if abs(value) >= 1000 else f"{value:.3g}"
+        "–" if value is None else _thousands(value) if value >= 1000 else f"{value:.3g}" if value > 1e-9 else "0"
     )
     environment.filters["thousands"] = _thousands
     environment.filters["words"] = lambda name: name.replace("_", " ")
