@@ -24,12 +24,12 @@ from typing import get_args
 
 import msgspec
 
-from trifix.config import Config, paper_options, to_toml
+from trifix.config import Config, paper_options, to_toml, with_overrides
 from trifix.errors import ConfigError, TrifixError
 from trifix.experiments.measuring import Part, measure
 from trifix.files.tables import write_atomically
 from trifix.outputs.summary import versions
-from trifix.sources.scenes import recipe_of
+from trifix.sources.scenes import Sensing, recipe_of
 from trifix.sources.simulation import simulate
 from trifix.stages.identify.congruence import Technique
 
@@ -37,6 +37,9 @@ SCENES = ("statue", "plane", "sphere", "head", "head-front")
 """The paper's, in its order."""
 TECHNIQUES: tuple[Technique, ...] = get_args(Technique)
 """All that the paper names."""
+_NEAREST_MM, _FARTHEST_MM = Sensing().depth_mm
+WORKING_RANGE = {"match.min_depth_mm": str(_NEAREST_MM), "match.max_depth_mm": str(_FARTHEST_MM)}
+"""The depths for which the sensor of the scenes is made: pairs that meet elsewhere are no targets."""
 _SHOWN_EVERY = 20  # frames
 _DRAWN_BY = ("experiments/figures.py", "experiments/page.py", "cli.py", "__main__.py")  # a part does not depend on it
 
@@ -116,7 +119,7 @@ def tasks(
         simulations.append(Task(f"{scene}: simulate", key, scene, room, seed, n))
         for technique in TECHNIQUES:
             if technique in techniques:
-                options = paper_options(technique)
+                options = with_overrides(paper_options(technique), WORKING_RANGE)
                 name, file = f"{scene}: {technique}", out / "parts" / f"{scene}-{technique}.json"
                 measurements.append(Task(name, _key(key, to_toml(options)), scene, room, seed, n, options, file))
     return simulations, measurements
