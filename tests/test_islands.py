@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from constellations import frame_of, looking, scattered, seen_points
+from constellations import frame_of, front_map, looking, scattered, seen_points
 from trifix.config import Config, to_toml, with_overrides
 from trifix.evaluation import compare_poses
 from trifix.geometry.pose import Pose
@@ -164,3 +164,16 @@ def test_an_island_that_stays_has_a_folder_with_its_map(strip: np.ndarray, tmp_p
     island = out / "islands" / "1"
     assert sorted(path.name for path in island.iterdir()) == ["map.csv", "poses.csv", "trajectory.tum"]
     assert len((island / "trajectory.tum").read_text().splitlines()) == 6
+
+
+def test_a_frozen_map_has_no_islands(strip: np.ndarray) -> None:
+    known = strip[strip[:, 0] < 0]
+    frames = list(visit(strip, -160.0, 160.0, -20.0, 160.0))
+    positioner = Positioner(map=front_map(known), is_map_frozen=True, is_noise_stated=True)
+    steps = list(positioner.run(frame for frame, _ in frames))
+    revised = list(positioner.revise([step.remembered() for step in steps]))
+    assert events(steps) == []
+    assert len(positioner.map) == len(known)
+    for step in revised[6:12]:
+        assert isinstance(step.fix, NoFix)
+        assert step.fix.why in (Reason.no_candidate, Reason.not_proven)

@@ -67,6 +67,7 @@ class Positioner:
         self._founded = 0
         self._joined: set[int] = set()
         self._is_map_given = map is not None
+        self._is_map_frozen = is_map_frozen
         self._cameras = ThreadPoolExecutor(2, thread_name_prefix="camera")
 
     @property
@@ -208,6 +209,7 @@ class Positioner:
             isinstance(fix, NoFix)
             and fix.why in _COULD_BE_ELSEWHERE
             and options.max_islands > 0
+            and not self._is_map_frozen
             and len(points) >= options.min_points
             and isinstance(_define_world(points), Fix)
         )
@@ -269,8 +271,10 @@ class Positioner:
                 if known is not None and isinstance(known.fix, Fix):
                     self._world.follow(frame.timestamp_ns, known.fix)
                     continue
-                step = self._judge(frame, learns=known is None)  # an island's frames have taught the map already
+                step = self._judge(frame, learns=False)
                 if isinstance(step.fix, Fix):
+                    if self._in_world(steps[k]) is None:  # the frames of an island that has joined have taught already
+                        self._teach(step)
                     placed[k] = step.remembered()
         self._world.rest()
         for k, before in enumerate(steps):
@@ -283,6 +287,13 @@ class Positioner:
             yield replace(
                 step, frame=before.frame, events=before.events, timings_ms=_sum(before.timings_ms, step.timings_ms)
             )
+
+    def _teach(self, step: Step) -> None:
+        """The world learns from a step that was judged without; islands may join by what it adds."""
+        if step.points is not None and isinstance(step.fix, Fix):
+            clock = Stopwatch()
+            self._learn(step.frame, step.points, step.matches, self._world, step.fix, clock)
+            self._join_islands(step.frame, self._world, step.fix, clock)
 
     def _choose_world(self) -> None:
         """The island of most frames is the world of a recording, unless a map was given."""
