@@ -74,6 +74,7 @@ def run(
     update: Literal["kalman", "mean"] | None = None,
     frame_triangles: Literal["auto", "all", "local"] | None = None,
     sigma_px: float | None = None,
+    target_diameter_mm: float | None = None,
     config: Path | None = None,
     settings: Settings = (),
 ) -> None:
@@ -95,6 +96,7 @@ def run(
         frame_triangles: Look at all triangles of a frame, or at those between neighbours.
         sigma_px: Standard deviation of a dot's centre to start from, where the recording states none (px); 0.3 unless
             an option says otherwise.
+        target_diameter_mm: Diameter of the targets (mm); pairs of dots that are not that large are left out.
         config: TOML file of options; `trifix config` prints one.
         settings: An option by its full name, such as match.max_depth_mm=900; may be repeated.
     """
@@ -110,6 +112,7 @@ def run(
             "identify.technique": identify,
             "identify.frame_triangles": frame_triangles,
             "noise.sigma_px": sigma_px,
+            "match.target_diameter_mm": target_diameter_mm,
             "verify.method": verify,
             "update.method": update,
         },

@@ -148,6 +148,14 @@ def test_sizes_are_compared_as_they_are_in_space():
     assert len(match(sized(one, 10.0, 10.0), rig, options)) == 0
 
 
+def test_dots_of_another_size_than_the_targets_are_left_out():
+    one = seen_dots(np.array([[60.0, 0.0, 400.0]]), np.random.default_rng(9), 0.05, PARALLEL)
+    for diameter_mm, is_kept in ((0.0, True), (4.0, True), (2.5, True), (1.5, False), (9.0, False)):
+        options = MatchOptions(target_diameter_mm=diameter_mm)
+        assert len(match(sized(one, 10.0, 10.0), PARALLEL, options)) == is_kept  # 10 px at 400 mm: 4 mm
+    assert len(match(sized(one, np.nan, np.nan), PARALLEL, MatchOptions(target_diameter_mm=4.0))) == 1
+
+
 def test_labels_must_agree_where_both_dots_have_one():
     xyz = np.array([[0.0, 10.0, 400.0], [4.1, 10.25, 410.0], [8.4, 10.5, 420.0]])
     dots = seen_dots(xyz, np.random.default_rng(4), 0.05, PARALLEL)
@@ -169,6 +177,7 @@ def test_without_dots_there_are_no_pairs(left, right):
         ({"max_epipolar_sigmas": 0.0}, "match.max_epipolar_sigmas is 0.0"),
         ({"min_depth_mm": -1.0}, "must not be negative"),
         ({"min_depth_mm": 500.0, "max_depth_mm": 400.0}, "expected more than min_depth_mm = 500.0"),
+        ({"target_diameter_mm": -1.0}, "match.target_diameter_mm is -1.0"),
         ({"max_size_ratio": 0.5}, "match.max_size_ratio is 0.5"),
     ],
 )

@@ -27,6 +27,8 @@ class MatchOptions:
     """Farthest depth of a target before either camera (mm); 0: fifteen baselines."""
     max_size_ratio: float = 2.0
     """Largest ratio of the two dots' diameters, each scaled by its camera's focal length and depth."""
+    target_diameter_mm: float = 0.0
+    """Diameter of the targets (mm): a pair whose dots are not that large, within the ratio, is none; 0 if unknown."""
 
     def __post_init__(self) -> None:
         if self.max_epipolar_sigmas <= 0:
@@ -36,6 +38,10 @@ class MatchOptions:
         if self.max_depth_mm and self.max_depth_mm <= self.min_depth_mm:
             raise ConfigError(
                 f"match.max_depth_mm is {self.max_depth_mm}, expected more than min_depth_mm = {self.min_depth_mm}."
+            )
+        if self.target_diameter_mm < 0:
+            raise ConfigError(
+                f"match.target_diameter_mm is {self.target_diameter_mm}, expected a length, or 0 where it is unknown."
             )
         if self.max_size_ratio < 1:
             raise ConfigError(f"match.max_size_ratio is {self.max_size_ratio}, expected at least 1.")
@@ -68,7 +74,11 @@ def match(
         keep = (np.minimum(z_left, z_right) >= nearest_mm) & (np.maximum(z_left, z_right) <= farthest_mm)
         size_left = dots.left.diameter_px[left] * z_left / rig.left.fu_px
         size_right = dots.right.diameter_px[right] * z_right / rig.right.fu_px
-        keep &= ~(np.abs(np.log(size_left / size_right)) > np.log(options.max_size_ratio))  # unknown sizes pass
+        widest = np.log(options.max_size_ratio)  # unknown sizes pass
+        keep &= ~(np.abs(np.log(size_left / size_right)) > widest)
+        if options.target_diameter_mm:
+            for size in (size_left, size_right):
+                keep &= ~(np.abs(np.log(size / options.target_diameter_mm)) > widest)
     keep &= ~((dots.left.label[left] >= 0) & (dots.right.label[right] >= 0)) | (
         dots.left.label[left] == dots.right.label[right]
     )
