@@ -56,6 +56,17 @@ def world() -> np.ndarray:
 # --- refusals --------------------------------------------------------------------------------------------------------
 
 
+def test_thousands_of_points_are_refused_at_once(world: np.ndarray) -> None:
+    rng = np.random.default_rng(1)
+    there = looking(rng)
+    crowd = points_of(rng.uniform(-200.0, 200.0, (2500, 3)) + [0, 0, 500.0], np.tile(np.eye(3) * 0.01, (2500, 1, 1)))
+    positioner = Positioner(is_noise_stated=True)
+    steps = list(positioner.run(frame_of(k, c) for k, c in enumerate([crowd, seen_points(world, there, rng), crowd])))
+    assert "2500 points" in refused(steps[0], Reason.out_of_time).detail
+    assert fixed(steps[1].fix).reason is PositionedReason.defines_world
+    refused(steps[2], Reason.out_of_time)
+
+
 @pytest.mark.parametrize("count", [0, 1, 2])
 @pytest.mark.parametrize("level", ["dots", "points"])
 def test_fewer_than_three_points_are_too_few(world, count, level):

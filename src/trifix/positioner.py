@@ -170,6 +170,9 @@ class Positioner:
             return None, None, NoFix(frame.content.reason, frame.content.detail)
         if len(points) < 3:
             return None, None, NoFix(Reason.too_few_points, f"{len(points)} points.")
+        limit = self.config.identify.max_points
+        if len(points) > limit:
+            return None, None, NoFix(Reason.out_of_time, f"{len(points)} points, and at most {limit} are searched.")
         if len(self.map) == 0:
             fix = _define_world(points)
             return (self._world if isinstance(fix, Fix) else None), None, fix

@@ -10,6 +10,8 @@ from jaxtyping import Float, Int
 from trifix.geometry.camera import StereoRig
 from trifix.geometry.pose import skew
 
+_ROWS = 1024  # left dots at a time
+
 
 def essential_matrix(rig: StereoRig) -> Float[np.ndarray, "3 3"]:
     """E = [t]× R of ``T_right_left``, with the baseline scaled to one."""
@@ -53,6 +55,9 @@ def pairs_near_epipolar_lines(
 ) -> tuple[Int[np.ndarray, "p"], Int[np.ndarray, "p"]]:
     """All pairs (left row, right row) whose right slope lies within ``gate`` of the left one's epipolar line."""
     lines = epipolar_lines(E, xy_left)
-    distance = np.abs(lines @ np.c_[xy_right, np.ones(len(xy_right))].T)
-    left, right = np.nonzero(distance < gate)
-    return left, right
+    right_h = np.c_[xy_right, np.ones(len(xy_right))].T
+    pairs = [(np.zeros(0, dtype=np.int64), np.zeros(0, dtype=np.int64))]
+    for first in range(0, len(lines), _ROWS):  # a block at a time: all distances at once may not fit into memory
+        left, right = np.nonzero(np.abs(lines[first : first + _ROWS] @ right_h) < gate)
+        pairs.append((left + first, right))
+    return np.concatenate([left for left, _ in pairs]), np.concatenate([right for _, right in pairs])

@@ -36,6 +36,8 @@ class IdentifyOptions:
     """Triangles of the map to compare before what was found is verified, likeliest first."""
     max_hypotheses: int = 10_000
     """Hypotheses to try at most of each portion, likeliest first."""
+    max_points: int = 2000
+    """A frame of more points, false pairs among them, is refused: it could not be searched in time."""
     max_step_mm: float = 30.0
     """Closest points pair across at most this distance from where the last pose puts them (mm)."""
 
@@ -46,6 +48,8 @@ class IdentifyOptions:
             raise ConfigError("identify.max_sigmas and identify.tolerance_mm must not be negative nor both zero.")
         if min(self.portion, self.max_hypotheses) < 1:
             raise ConfigError("identify.portion and identify.max_hypotheses must be at least 1.")
+        if self.max_points < 3:
+            raise ConfigError(f"identify.max_points is {self.max_points}, expected at least 3.")
         if self.max_step_mm <= 0:
             raise ConfigError(f"identify.max_step_mm is {self.max_step_mm}, expected a positive length.")
 
