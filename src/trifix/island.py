@@ -7,13 +7,15 @@ Knows no image and no other island, but for the moment in which it absorbs one.
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
+from itertools import chain
 from time import perf_counter
 from typing import assert_never
 
 import numpy as np
-from jaxtyping import Int
+from jaxtyping import Float, Int
 
 from trifix.config import Config
+from trifix.geometry.alignment import point_jacobian
 from trifix.geometry.pose import Pose
 from trifix.records import (
     Fix,
@@ -28,13 +30,15 @@ from trifix.records import (
     SensorPoints,
     StereoMatches,
 )
-from trifix.stages.identify import identifier
+from trifix.stages.identify import AllTriangles, identifier
 from trifix.stages.orient import orient
 from trifix.stages.predict import Motion, follow, predict
 from trifix.stages.update import found_map, update
 from trifix.stages.verify import verify
 from trifix.stages.verify_residual import verify_residual
 
+_WIDENED_POINTS, _WIDENED_TARGETS = 40, 300  # beyond, all triangles would take too long
+_WIDENED_PORTION = 50_000
 NOTHING = np.zeros(0, dtype=np.int64)
 
 
@@ -46,6 +50,11 @@ class Island:
         self.map = map
         self.frames = 0
         self.is_absorbed = False
+        self.removed = NOTHING
+        """Identities of the targets that the last lesson took out of the map."""
+        self._gauge = np.zeros((6, 6))
+        self._all_triangles = AllTriangles(config.identify)
+        self._widened_for: ReferenceMap | None = None
         self.motion: Motion | None = None
         self._config = config
         self._is_frozen = is_frozen
@@ -63,7 +72,7 @@ class Island:
         best, tried = NoFix(Reason.no_candidate), 0
         prediction = None if timestamp_ns is None else predict(self.motion, timestamp_ns, self._config.predict)
         last_pose = self.motion.newest if self.motion else None
-        portions = self.identifier.identify(points, self.map, last_pose)
+        portions = chain(self.identifier.identify(points, self.map, last_pose), self._widened(points))
         identification = None
         while best.why in (Reason.no_candidate, Reason.not_proven, Reason.residual):
             with clock("identify"):
@@ -82,6 +91,18 @@ class Island:
             tried += len(identification)
         return identification, best
 
+    def _widened(self, points: SensorPoints) -> Iterator[Identification]:
+        """All triangles, or those of near targets where that would be too many, for what the technique did not find."""
+        options = self._config.identify
+        targets = int(self.map.alive.sum())
+        if not options.widens or len(points) > _WIDENED_POINTS or targets > _WIDENED_TARGETS:
+            return
+        if self._widened_for is not self.map:
+            self._all_triangles = AllTriangles(replace(options, portion=_WIDENED_PORTION))
+            self._all_triangles.learn(self.map, NOTHING)
+            self._widened_for = self.map
+        yield from self._all_triangles.identify(points, self.map)
+
     def learn(
         self,
         frame: Frame,
@@ -92,18 +113,41 @@ class Island:
     ) -> Int[np.ndarray, "a"]:
         """A fix to a better map; returns the rows of the targets that are new."""
         self.frames += 1
+        self.removed = NOTHING
         self.follow(frame.timestamp_ns, fix)
         if self._is_frozen:
             self.identifier.learn(self.map, fix.target)
             return NOTHING
         if fix.reason is PositionedReason.defines_world:
+            self._gauge = _pose_covariance(points.xyz_mm, points.cov_mm2)
             self.map, added = found_map(points, frame.index, next_id)
         else:
+            before = self.map
             self.map, added = update(
                 self.map, points, matches, fix, frame.index, frame.rig, next_id, self._config.update
             )
+            gone = np.flatnonzero(before.alive)
+            self.removed = before.id[gone[before.id[gone] != np.where(self.map.alive, self.map.id, -1)[gone]]]
         self.identifier.learn(self.map, np.unique(np.concatenate([fix.target, added])))
         return added
+
+    def in_gauge(self, fix: Fix) -> Fix:
+        """The fix with what it owes to the first frame, whose coordinates are this map's, in its covariance.
+
+        Averaging makes the targets' covariances small, as if their common error left with the others. In the first
+        frame's coordinates it stays: they are known as well as that frame's own pose. Of n sightings, 1/n of it is
+        still in the targets' covariances.
+        """
+        if fix.reason is PositionedReason.defines_world:
+            return fix
+        averaged = 1.0 - 1.0 / np.maximum(self.map.sightings[fix.target], 1).mean()
+        A = fix.T_world_sensor.inverse().adjoint()
+        return replace(fix, cov=fix.cov + averaged * (A @ self._gauge @ A.T))
+
+    def rescale(self, ratio: float) -> None:
+        """Follows a change of the noise scale: all covariances are in proportion to its square."""
+        self._gauge = self._gauge * ratio**2
+        self.map = replace(self.map, cov_mm2=self.map.cov_mm2 * ratio**2)
 
     def follow(self, timestamp_ns: int, fix: Fix) -> None:
         """Takes note of where the sensor was, for the next prediction."""
@@ -172,6 +216,12 @@ class Island:
                 return verify_residual(points, self.map, orientations, options.counterpart_mm, options.max_residual_mm)
             case _:
                 assert_never(options.method)
+
+
+def _pose_covariance(xyz_mm: Float[np.ndarray, "n 3"], cov_mm2: Float[np.ndarray, "n 3 3"]) -> np.ndarray:
+    """Covariance of the pose of a sensor that sees n points, were they known exactly: (Σ Jᵀ C⁻¹ J)⁻¹."""
+    J = point_jacobian(xyz_mm)
+    return np.asarray(np.linalg.inv(np.einsum("nij,nik->jk", J, np.linalg.solve(cov_mm2, J))))
 
 
 class Stopwatch:

@@ -14,6 +14,7 @@ import numpy as np
 from jaxtyping import Int
 
 from trifix.config import Config
+from trifix.errors import MapError
 from trifix.files.recordings import Recording, read_recording
 from trifix.geometry.alignment import spread_off_line_mm
 from trifix.geometry.pose import Pose
@@ -39,6 +40,7 @@ from trifix.stages.detect import detect
 from trifix.stages.identify import Identifier
 from trifix.stages.match import match
 from trifix.stages.triangulate import triangulate
+from trifix.stages.update import distinct
 from trifix.stages.weigh import NoiseScale, add_prior_noise, scale_points, weigh_matches, weigh_residuals
 
 _COULD_BE_ELSEWHERE = (Reason.no_candidate, Reason.not_proven)
@@ -60,6 +62,8 @@ class Positioner:
         self.config = config or Config()
         self.noise = NoiseScale()
         self._is_noise_stated = is_noise_stated
+        if is_map_frozen and (map is None or not map.alive.any()):
+            raise MapError("A frozen map without targets was given: nothing could ever be found on it.")
         self._world = Island(0, self.config, map or ReferenceMap.empty(), is_map_frozen)
         self._next_id = int(self.map.id.max(initial=-1)) + 1
         self._last_ns = -(1 << 63)
@@ -103,6 +107,7 @@ class Positioner:
         if learns and points is not None:
             if there is not None and island is not None:
                 added = self._learn(frame, points, matches, island, there, clock)
+                events += [Event("target_removed", int(each), "not seen again") for each in island.removed]
             elif self._may_found(points, fix):
                 island, there = self._found_island(frame, points)
                 events.append(Event("island_founded", None, f"island {island.number}, {len(points)} targets"))
@@ -111,13 +116,17 @@ class Positioner:
                 if island.is_absorbed:  # the island has just become part of the world
                     island = self._world
                     identification, fix = island.position(points, matches, frame.timestamp_ns, clock)
+            if isinstance(fix, NoFix) and fix.weak is not None:
+                self._weigh(points, matches, self.map, fix.weak)
         elif there is not None and island is not None:
             island.follow(frame.timestamp_ns, there)
         elsewhere = None
         if island is not None and island is not self._world and there is not None:
-            elsewhere, added = Elsewhere(island.number, there, island.map), NOTHING
+            elsewhere, added = Elsewhere(island.number, island.in_gauge(there), island.map), NOTHING
             if isinstance(fix, Fix):
                 fix = NoFix(Reason.other_island, f"It is on island {island.number}, of {len(island.map)} targets.")
+        elif isinstance(fix, Fix):
+            fix = self._world.in_gauge(fix)
         return Step(
             frame=frame,
             dots=dots,
@@ -150,7 +159,7 @@ class Positioner:
                 with clock("match"):
                     matches = match(content, frame.rig, options.match, self.noise.scale)
                     if not self.noise.is_known:
-                        self._weigh(matches)
+                        self._weigh_pairs(matches)
                 with clock("triangulate"):
                     points = triangulate(content, matches, frame.rig, self.noise.scale)
                 return content, matches, points
@@ -196,10 +205,7 @@ class Positioner:
         clock: Stopwatch,
     ) -> np.ndarray:
         """A fix to a better map; returns the rows of the targets that are new."""
-        if matches is None:
-            self.noise = weigh_residuals(self.noise, points, island.map, fix, self._is_noise_stated, self.config.noise)
-        elif fix.reason is not PositionedReason.defines_world:
-            self._weigh(matches.rows(points.match[fix.point]))
+        self._weigh(points, matches, island.map, fix)
         with clock("update"):
             added = island.learn(frame, points, matches, fix, self._next_id)
             self._next_id += len(added)
@@ -248,12 +254,26 @@ class Positioner:
             events.append(Event("island_joined", None, f"island {other.number}, {common} common targets, {new} new"))
         return events
 
-    def _weigh(self, matches: StereoMatches) -> None:
+    def _weigh(self, points: SensorPoints, matches: StereoMatches | None, map: ReferenceMap, fix: Fix) -> None:
+        """What identified points tell of the recording's noise: by their residuals, or their dots' epipolar ones."""
+        if matches is None:
+            options = self.config.noise
+            self._take_noise(weigh_residuals(self.noise, points, map, fix, self._is_noise_stated, options))
+        elif fix.reason is not PositionedReason.defines_world:
+            self._weigh_pairs(matches.rows(points.match[fix.point]))
+
+    def _weigh_pairs(self, matches: StereoMatches) -> None:
         """Epipolar residuals to the recording's noise: those of identified points, or all before anything is known."""
-        options = self.config
-        self.noise = weigh_matches(
-            self.noise, matches, options.match.max_epipolar_sigmas, self._is_noise_stated, options.noise
-        )
+        gate, options = self.config.match.max_epipolar_sigmas, self.config.noise
+        self._take_noise(weigh_matches(self.noise, matches, gate, self._is_noise_stated, options))
+
+    def _take_noise(self, noise: NoiseScale) -> None:
+        """A new noise scale; what the maps owe to the old one follows it."""
+        ratio = noise.scale / self.noise.scale
+        self.noise = noise
+        if ratio != 1.0 and not self._is_map_given:
+            for island in (self._world, *self._islands):
+                island.rescale(ratio)
 
     def revise(self, steps: Sequence[Step]) -> Iterator[Step]:
         """Every frame again, by all that has become known since: what a recording allows and a live run does not.
@@ -352,14 +372,14 @@ def position(
 def _define_world(points: SensorPoints) -> Fix | NoFix:
     """The first frame is where the world begins, if its points could ever be recognised."""
     if spread_off_line_mm(points.xyz_mm) < 3.0:
-        return NoFix(Reason.weak_geometry, "The points lie on one line.")
-    rows = np.arange(len(points))
+        return NoFix(Reason.weak_geometry, "The points lie within 3 mm of one line.")
+    rows = distinct(points, np.arange(len(points)))
     return Fix(
         T_world_sensor=Pose.identity(),
         cov=np.zeros((6, 6)),
         point=rows,
-        target=rows,
-        residual_mm=np.zeros(len(points)),
+        target=np.arange(len(rows)),
+        residual_mm=np.zeros(len(rows)),
         p_chance=float("nan"),
         reason=PositionedReason.defines_world,
     )

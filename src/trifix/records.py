@@ -369,6 +369,8 @@ class NoFix:
     """Root mean square residual of the best candidate (mm)."""
     rivals: tuple[Rival, ...] = ()
     """The poses that could not be told apart, best first."""
+    weak: Fix | None = None
+    """For weak_geometry: the fix that it would be, were it firmer; it still tells how noisy the frame is."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -73,3 +73,14 @@ def spread_off_line_mm(xyz_mm: Float[np.ndarray, "n 3"]) -> float:
         return 0.0
     s = np.linalg.svd(xyz_mm - xyz_mm.mean(axis=0), compute_uv=False)
     return float(np.sqrt((s[1:] ** 2).sum() / len(xyz_mm)))
+
+
+def point_jacobian(xyz_mm: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3 6"]:
+    """[I, −[p]×]: how points in sensor coordinates move with δ = (translation mm, rotation rad) of the sensor."""
+    J = np.zeros((len(xyz_mm), 3, 6))
+    J[:, :, :3] = np.eye(3)
+    x, y, z = xyz_mm.T
+    J[:, 0, 4], J[:, 0, 5] = z, -y
+    J[:, 1, 3], J[:, 1, 5] = -z, x
+    J[:, 2, 3], J[:, 2, 4] = y, -x
+    return J

@@ -11,6 +11,7 @@ import cv2
 import numpy as np
 from jaxtyping import Float
 
+from trifix.errors import ConfigError
 from trifix.kernels.detection import (
     AROUND,
     COV_UU,
@@ -69,8 +70,18 @@ class DetectOptions:
     """Largest rms residual of the fitted ellipse beyond the image's noise, as a fraction of the step; less refuses more
     clutter."""
 
+    def __post_init__(self) -> None:
+        if not 0 < self.min_diameter_px < self.max_diameter_px:
+            raise ConfigError(
+                f"detect.min_diameter_px is {self.min_diameter_px}, expected more than 0 and less than "
+                f"max_diameter_px = {self.max_diameter_px}."
+            )
+        for name in ("min_axis_ratio", "min_contrast", "max_misfit"):
+            if not 0 < getattr(self, name) <= 1:
+                raise ConfigError(f"detect.{name} is {getattr(self, name)}, expected a fraction above 0 and at most 1.")
 
-def detect(image: GreyOrColour, options: DetectOptions) -> Dots:
+
+def detect(image: GreyOrColour, options: DetectOptions = DetectOptions()) -> Dots:
     """Dots of one image, from top to bottom.
 
     Blobs on the local threshold at every level of a pyramid; then least squares of a blurred ellipse to the grey

@@ -11,8 +11,9 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from trifix.errors import ConfigError
+from trifix.geometry.alignment import point_jacobian
 from trifix.geometry.camera import StereoRig
-from trifix.geometry.pose import Pose, skew
+from trifix.geometry.pose import Pose
 from trifix.records import Fix, ReferenceMap, SensorPoints, StereoMatches, TargetState
 
 
@@ -35,10 +36,10 @@ class UpdateOptions:
             raise ConfigError("update.trusted_after must be at least 1, max_misses and new_target_sigmas at least 0.")
 
 
-def found_map(points: SensorPoints, frame_index: int, next_id: int = 0) -> tuple[ReferenceMap, np.ndarray]:
+def found_map(points: SensorPoints, frame_index: int, next_id: int = 0) -> tuple[ReferenceMap, Int[np.ndarray, "a"]]:
     """The map of the first frame, whose sensor coordinates become the world's, and the rows of its targets."""
-    everything = np.arange(len(points))
-    return _with_points(ReferenceMap.empty(), points, everything, Pose.identity(), None, frame_index, next_id)
+    rows = distinct(points, np.arange(len(points)))
+    return _with_points(ReferenceMap.empty(), points, rows, Pose.identity(), None, frame_index, next_id)
 
 
 def update(
@@ -116,10 +117,7 @@ def world_covariance(
     """Covariance in world coordinates of points seen from an uncertain pose: R (C + J P Jᵀ) Rᵀ with J = [I, −[p]×]."""
     total = cov_mm2
     if cov is not None:
-        J = np.zeros((len(xyz_mm), 3, 6))
-        J[:, :, :3] = np.eye(3)
-        for row, p in enumerate(xyz_mm):
-            J[row, :, 3:] = -skew(p)
+        J = point_jacobian(xyz_mm)
         total = cov_mm2 + J @ cov @ np.swapaxes(J, 1, 2)
     return np.asarray(T.R @ total @ T.R.T)
 
@@ -162,7 +160,7 @@ def _new_points(
     if matches is not None:
         left, right = matches.left[points.match], matches.right[points.match]
         is_free &= ~np.isin(left, left[fix.point]) & ~np.isin(right, right[fix.point])
-    new = np.flatnonzero(is_free)
+    new = distinct(points, np.flatnonzero(is_free))
     alive = np.flatnonzero(map.alive)
     if len(new) == 0 or len(alive) == 0:
         return new
@@ -173,6 +171,12 @@ def _new_points(
     r = map.xyz_mm[nearest] - world[:, None]
     d2 = np.einsum("nki,nki->nk", r, np.linalg.solve(C[:, None] + map.cov_mm2[nearest], r[..., None])[..., 0])
     return np.asarray(new[(d2 > options.new_target_sigmas**2).all(axis=1)])
+
+
+def distinct(points: SensorPoints, rows: Int[np.ndarray, "r"]) -> Int[np.ndarray, "d"]:
+    """Those of some points that are not the same measurement as an earlier one."""
+    _, first = np.unique(points.xyz_mm[rows].round(6), axis=0, return_index=True)
+    return rows[np.sort(first)]
 
 
 def _with_points(

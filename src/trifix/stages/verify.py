@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from trifix.errors import ConfigError
-from trifix.geometry.alignment import align_weighted
+from trifix.geometry.alignment import align_weighted, point_jacobian
 from trifix.geometry.pose import Pose
 from trifix.kernels import positioning as kernels
 from trifix.records import (
@@ -210,7 +210,7 @@ def judge(
 ) -> Fix | NoFix:
     """Accepts the best solution if it is proven, without rival and firmly held."""
     best = solutions[0]
-    p_chance = float(min(1.0, np.exp(np.log(tried) - best.log_ratio)))
+    p_chance = float(np.clip(np.exp(np.log(max(tried, 1e-300)) - best.log_ratio), 1e-300, 1.0))
     residual = map.xyz_mm[best.target] - best.T_world_sensor.apply(points.xyz_mm[best.point])
     residual_mm = np.linalg.norm(residual, axis=1)
     rms_mm = float(np.sqrt(np.mean(residual_mm**2)))
@@ -231,10 +231,7 @@ def judge(
             f"{len(rivals)} poses explain {', '.join(str(len(s.point)) for s in rivals[:4])} points.",
             tuple(Rival(s.T_world_sensor, s.log_ratio, len(s.point)) for s in rivals),
         )
-    sigma_mm, sigma_deg = pose_sigma(best.cov, points.xyz_mm[best.point])
-    if sigma_mm > options.max_sigma_mm or sigma_deg > options.max_sigma_deg:
-        return refuse(Reason.weak_geometry, f"The pose is known to {sigma_mm:.2f} mm and {sigma_deg:.3f} degrees only.")
-    return Fix(
+    fix = Fix(
         T_world_sensor=best.T_world_sensor,
         cov=best.cov,
         point=best.point,
@@ -242,6 +239,11 @@ def judge(
         residual_mm=residual_mm,
         p_chance=p_chance,
     )
+    sigma_mm, sigma_deg = pose_sigma(best.cov, points.xyz_mm[best.point])
+    if sigma_mm > options.max_sigma_mm or sigma_deg > options.max_sigma_deg:
+        detail = f"The pose is known to {sigma_mm:.2f} mm and {sigma_deg:.3f} degrees only."
+        return replace(refuse(Reason.weak_geometry, detail), weak=fix)
+    return fix
 
 
 def false_hypotheses(identification: Identification, best: Solution) -> float:
@@ -275,12 +277,7 @@ def motion_log_ratio(T_world_sensor: Pose, prediction: Prediction, area_mm2: flo
 
 def pose_sigma(cov: Float[np.ndarray, "6 6"], xyz_mm: Float[np.ndarray, "c 3"]) -> tuple[float, float]:
     """Standard deviation of a pose at some points (mm, rms) and about its worst axis (degrees)."""
-    J = np.zeros((len(xyz_mm), 3, 6))
-    J[:, :, :3] = np.eye(3)
-    x, y, z = xyz_mm.T
-    J[:, 0, 4], J[:, 0, 5] = z, -y
-    J[:, 1, 3], J[:, 1, 5] = -z, x
-    J[:, 2, 3], J[:, 2, 4] = y, -x
+    J = point_jacobian(xyz_mm)
     variance = np.einsum("nij,jk,nik->n", J, cov, J)
     return float(np.sqrt(variance.mean())), float(np.degrees(np.sqrt(np.linalg.eigvalsh(cov[3:, 3:])[-1])))
 

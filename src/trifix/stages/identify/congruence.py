@@ -36,6 +36,8 @@ class IdentifyOptions:
     """Triangles of the map to compare before what was found is verified, likeliest first."""
     max_hypotheses: int = 10_000
     """Hypotheses to try at most of each portion, likeliest first."""
+    widens: bool = True
+    """What the technique does not find is sought among all triangles, in maps of up to 300 targets."""
     max_points: int = 2000
     """A frame of more points, false pairs among them, is refused: it could not be searched in time."""
     max_step_mm: float = 30.0
