@@ -35,7 +35,7 @@ def read_rig(path: Path) -> StereoRig:
     """
     try:
         content: object = yaml.load(read_text(path, CalibrationError), Loader=yaml.CSafeLoader)
-    except yaml.YAMLError as fault:
+    except (yaml.YAMLError, ValueError, RecursionError) as fault:  # ValueError: a date or a number that cannot be
         raise CalibrationError(f"{path} is not YAML: {' '.join(str(fault).split())}.") from None
     chain = _mapping(content, path, "the file")
     cameras = [_mapping(_get(chain, name, path, ""), path, name) for name in ("cam0", "cam1")]
@@ -171,7 +171,7 @@ def _number(value: object, path: Path, name: str) -> float:
     """A finite number; text too, as YAML 1.1 takes 1e-05 (no point) for text."""
     try:
         number = math.nan if isinstance(value, bool) or not isinstance(value, str | int | float) else float(value)
-    except ValueError:
+    except (ValueError, OverflowError):
         number = math.nan
     if not math.isfinite(number):
         raise CalibrationError(f"{path}, {name}: found {_short(value)}, expected finite numbers.")
