@@ -105,7 +105,11 @@ def test_names_that_count_frames_are_no_time_stamps(tmp_path: Path) -> None:
     ("left", "right", "message"),
     [
         (["a.png", "b.png"], ["a.png"], "found 2 images in left and 1 in right, expected pairs"),
-        (["1.png", "2.png"], ["1.png", "3.png"], r"left/2\.png would pair with .*right/3\.png: their numbers differ"),
+        (["1.png", "2.png"], ["1.png", "3.png"], r": left/2\.png, right/3\.png have no partner, expected names that"),
+        (["img_3.png"], ["img_33.png"], r": left/img_3\.png, right/img_33\.png have no partner"),
+        (["a1.png", "a2.png", "a3.png"], ["a2.png", "a3.png", "a4.png"], r": left/a1\.png, right/a4\.png have no"),
+        (["a1.png", "b2.png"], ["b1.png", "a2.png"], r": left/a1\.png, right/a2\.png have no partner"),
+        ([f"{k}.png" for k in range(5)], [f"{k}.png" for k in range(9, 14)], r"right/9\.png and 4 more have no"),
     ],
 )
 def test_folders_that_do_not_pair_up_are_refused(
@@ -114,6 +118,19 @@ def test_folders_that_do_not_pair_up_are_refused(
     write_folders(tmp_path, left, right)
     with pytest.raises(RecordingError, match=message):
         read_image_pairs(tmp_path)
+
+
+@pytest.mark.parametrize("name", ["{side}{k:02d}.png", "img_{k}_cam{camera}.png", "{side}_{letter}.png"])
+def test_names_may_tell_the_camera(tmp_path: Path, name: str) -> None:
+    left, right = (
+        [name.format(side=side, camera=camera, k=k, letter="abc"[k]) for k in range(3)]
+        for camera, side in enumerate(("left", "right"))
+    )
+    write_folders(tmp_path, left, right)
+    pairs = read_image_pairs(tmp_path)
+    assert [pairs.files(k) for k in range(3)] == [
+        (tmp_path / "left" / a, tmp_path / "right" / b) for a, b in zip(left, right, strict=True)
+    ]
 
 
 def test_empty_folders_are_refused(tmp_path: Path) -> None:

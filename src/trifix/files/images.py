@@ -35,6 +35,8 @@ class ImagePairs:
     """Decodes the left image of the k-th pair, or says why it cannot."""
     right: Callable[[int], GreyOrColour | str]
     """The same for the right one."""
+    files: Callable[[int], tuple[Path, Path]]
+    """Where the left and the right image of the k-th pair are stored."""
 
 
 def holds_images(folder: Path) -> bool:
@@ -134,6 +136,7 @@ def _read_folders(left_folder: Path, right_folder: Path) -> ImagePairs:
         raise RecordingError(
             f"{left_folder.parent}: found {len(left)} images in left and {len(right)} in right, expected pairs."
         )
+    _refuse_unpaired(left, right)
     return _image_files(*_stamps_of_names(left, right), left, right)
 
 
@@ -143,18 +146,38 @@ def _natural(path: Path) -> list[tuple[int, str]]:
     return [(int(part), part) if part.isdecimal() else (-1, part) for part in parts]
 
 
+def _refuse_unpaired(left: list[Path], right: list[Path]) -> None:
+    """Refuses sorted images whose names end in other numbers than their partners' do.
+
+    A number that several images of a folder end in tells none of them; it may be the camera's.
+    """
+    numbers, others = [_last_number(p) for p in left], [_last_number(p) for p in right]
+    if numbers == others or len(set(numbers)) < len(left) or len(set(others)) < len(right):
+        return
+    alone = [p for p, n in zip(left, numbers, strict=True) if n not in others]
+    alone += [p for p, n in zip(right, others, strict=True) if n not in numbers]
+    if not alone:
+        k = next(k for k, n in enumerate(numbers) if n != others[k])
+        alone = [left[k], right[k]]
+    shown = ", ".join(str(Path(p.parent.name) / p.name) for p in alone[:6])
+    more = f" and {len(alone) - 6} more" if len(alone) > 6 else ""
+    raise RecordingError(
+        f"{left[0].parent.parent}: {shown}{more} have no partner, expected names that end in the same numbers in left "
+        f"and right."
+    )
+
+
+def _last_number(path: Path) -> int:
+    """The last number in a name, -1 without any."""
+    return int(([-1] + re.findall(r"[0-9]+", path.stem))[-1])
+
+
 def _stamps_of_names(left: list[Path], right: list[Path]) -> tuple[Int[np.ndarray, "n"], bool]:
     """Time stamps of sorted images, and whether they are nominal: their names, if all step like nanoseconds."""
     nominal = np.arange(len(left)) * _NOMINAL_STEP_NS
     if not all(p.stem.isdecimal() and int(p.stem) < 2**63 for p in (*left, *right)):
         return nominal, True
-    numbers = [int(p.stem) for p in left]
-    for number, path, other in zip(numbers, left, right, strict=True):
-        if number != int(other.stem):
-            raise RecordingError(
-                f"{path} would pair with {other}: their numbers differ, expected the same numbers in left and right."
-            )
-    stamps = np.array(numbers, dtype=np.int64)
+    stamps = np.array([int(p.stem) for p in left], dtype=np.int64)
     if len(stamps) < 2 or np.diff(stamps).min() < _SHORTEST_STEP_NS:
         return nominal, True
     return stamps, False
@@ -163,7 +186,13 @@ def _stamps_of_names(left: list[Path], right: list[Path]) -> tuple[Int[np.ndarra
 def _image_files(
     timestamp_ns: Int[np.ndarray, "n"], is_nominal: bool, left: list[Path], right: list[Path]
 ) -> ImagePairs:
-    return ImagePairs(timestamp_ns, is_nominal, lambda k: read_image(left[k]), lambda k: read_image(right[k]))
+    return ImagePairs(
+        timestamp_ns,
+        is_nominal,
+        lambda k: read_image(left[k]),
+        lambda k: read_image(right[k]),
+        lambda k: (left[k], right[k]),
+    )
 
 
 def _read_videos(left_path: Path, right_path: Path) -> ImagePairs:
@@ -174,7 +203,7 @@ def _read_videos(left_path: Path, right_path: Path) -> ImagePairs:
             f"expected synchronous videos."
         )
     stamps = np.round(np.arange(left.count) * (1e9 / left.fps)).astype(np.int64)
-    return ImagePairs(stamps, True, left.read, right.read)
+    return ImagePairs(stamps, True, left.read, right.read, lambda _: (left_path, right_path))
 
 
 class _Video:

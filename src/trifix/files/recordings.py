@@ -81,7 +81,7 @@ class Recording:
         return Frame(int(self.index[k]), stamp, rig, self.content(k, rig))
 
 
-def read_recording(path: Path, level: Level | None = None, sigma_px: float = 0.3) -> Recording:
+def read_recording(path: Path | str, level: Level | None = None, sigma_px: float = 0.3) -> Recording:
     """The recording in a folder, at its richest level unless another is asked for.
 
     ``sigma_px`` is the standard deviation per axis of dots whose table states none, and of the dots behind points
@@ -91,6 +91,7 @@ def read_recording(path: Path, level: Level | None = None, sigma_px: float = 0.3
         RecordingError: the folder holds no recording, or one that is incomplete or contradicts itself.
         CalibrationError: the calibration is broken, or dots and images come without any.
     """
+    path = Path(path)
     if not path.is_dir():
         raise RecordingError(f"{path} is not a folder, expected a recording.")
     present = {
@@ -226,7 +227,7 @@ class _Images:
         images = self.decode(k)
         if isinstance(images, str):
             return Unusable(Reason.unreadable_image, images)
-        fault = _size_fault(images, rig)
+        fault = _size_fault(images, rig, self.pairs.files(k))
         return Unusable(Reason.unreadable_image, fault) if fault else images
 
     def decode(self, k: int) -> StereoImages | str:
@@ -327,13 +328,14 @@ def _read_rigs(
     return rig, rigs
 
 
-def _size_fault(images: StereoImages, rig: StereoRig) -> str:
+def _size_fault(images: StereoImages, rig: StereoRig, files: tuple[Path, Path]) -> str:
     """What is wrong with the sizes of a pair; empty if nothing is."""
-    for side, image, camera in (("left", images.left, rig.left), ("right", images.right, rig.right)):
+    cameras = (("left", images.left, rig.left), ("right", images.right, rig.right))
+    for file, (side, image, camera) in zip(files, cameras, strict=True):
         height, width = image.shape[:2]
         if (width, height) != (camera.width_px, camera.height_px):
             return (
-                f"the {side} image is {width} x {height} pixels, its calibration is for {camera.width_px} x "
+                f"the {side} image {file} is {width} x {height} pixels, its calibration is for {camera.width_px} x "
                 f"{camera.height_px}."
             )
     return ""
@@ -345,7 +347,7 @@ def _check_first_sizes(source: _Images, rigs: Mapping[int, StereoRig]) -> None:
     for k, rig in rigs.items():
         images = source.decode(k)
         if isinstance(images, StereoImages):
-            fault = _size_fault(images, rig)
+            fault = _size_fault(images, rig, source.pairs.files(k))
             if not fault:
                 return
             faults.append(f"image pair {k}: {fault}")
