@@ -64,7 +64,7 @@ def test_a_map_without_targets_survives_too(tmp_path: Path) -> None:
 
 def test_only_id_and_position_are_required(tmp_path: Path) -> None:
     (tmp_path / "map.csv").write_text("z_mm,id,x_mm,y_mm\n3,7,1,2\n")
-    read = read_map(tmp_path / "map.csv")
+    read = read_map(str(tmp_path / "map.csv"))
     assert (read.id.tolist(), read.xyz_mm.tolist()) == ([7], [[1, 2, 3]])
     assert (read.state.tolist(), read.sightings.tolist()) == ([TargetState.trusted], [0])
     assert np.isnan(read.view).all()
@@ -90,7 +90,8 @@ def test_optional_cells_may_be_empty_and_directions_are_normalised(tmp_path: Pat
     [
         ("id,x_mm,y_mm\n", r"map\.csv: column 'z_mm' is missing"),
         ("id,x_mm,y_mm,z_mm\n1,2,3,nan\n", r"line 2, column 'z_mm': found 'nan', expected a finite number"),
-        ("id,x_mm,y_mm,z_mm\n-1,2,3,4\n", r"line 2, column 'id': found -1, expected 0 or more"),
+        ("id,x_mm,y_mm,z_mm\n-1,2,3,4\n", r"line 2, column 'id': found -1, expected 0 to 9007199254740992"),
+        ("id,x_mm,y_mm,z_mm\n9007199254740993,2,3,4\n", r"line 2, column 'id': found 9007199254740993, expected 0 to"),
         ("id,x_mm,y_mm,z_mm\n4,2,3,4\n5,2,3,4\n4,2,3,4\n", r"line 4: id 4 already stands in line 2, expected it once"),
         ("id,x_mm,y_mm,z_mm,state\n1,2,3,4,truste\n", r"line 2, column 'state': found 'truste'.*nearest is trusted"),
         ("id,x_mm,y_mm,z_mm,state\n1,2,3,4,removed\n", r"column 'state': found 'removed'"),

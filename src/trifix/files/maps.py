@@ -23,11 +23,12 @@ from trifix.files.tables import (
 from trifix.records import ReferenceMap, TargetState
 
 _XYZ = ("x_mm", "y_mm", "z_mm")
+_LARGEST_ID = 2**53  # further on, programs that hold numbers as float64 mistake one for another
 _VIEW = ("nx", "ny", "nz")
 _STATES = tuple(state.name for state in TargetState if state is not TargetState.removed)
 
 
-def read_map(path: Path) -> ReferenceMap:
+def read_map(path: Path | str) -> ReferenceMap:
     """The map in a map.csv; only ``id`` and the position are required, the rest may be missing or empty.
 
     Without a covariance a target is where it is said to be, without a state it is trusted. Directions are normalised.
@@ -35,6 +36,7 @@ def read_map(path: Path) -> ReferenceMap:
     Raises:
         MapError: the file is missing, broken, names a target twice, or holds an impossible value.
     """
+    path = Path(path)
     table = read_table(
         path,
         {"id": int} | dict.fromkeys(_XYZ, float),
@@ -42,7 +44,7 @@ def read_map(path: Path) -> ReferenceMap:
         error=MapError,
     )
     identity, line = table["id"], table[LINE]
-    refuse_where(identity < 0, path, table, "id", "0 or more", MapError)
+    refuse_where((identity < 0) | (identity > _LARGEST_ID), path, table, "id", f"0 to {_LARGEST_ID}", MapError)
     first, count = np.unique(identity, return_index=True, return_counts=True)[1:]
     if (count > 1).any():
         twice = identity[first[int((count > 1).argmax())]]
