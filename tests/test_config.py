@@ -62,6 +62,8 @@ def test_given_values_take_their_place_and_the_rest_keeps_its_default() -> None:
         ({"boil": {}}, "my.toml: boil is unknown; expected one of mix, bake."),
         ({"mix": 3}, "my.toml: mix is 3, expected a section [mix]."),
         ({"mix": {"depth_mm": "deep"}}, 'my.toml: mix.depth_mm is "deep", expected a number.'),
+        ({"mix": {"depth_mm": float("nan")}}, "my.toml: mix.depth_mm is nan, expected a finite number."),
+        ({"mix": {"depth_mm": float("-inf")}}, "my.toml: mix.depth_mm is -inf, expected a finite number."),
         ({"mix": {"times": 2.5}}, "my.toml: mix.times is 2.5, expected a whole number."),
         ({"mix": {"times": True}}, "my.toml: mix.times is true, expected a whole number."),
         ({"mix": {"is_slow": 1}}, "my.toml: mix.is_slow is 1, expected true or false."),
@@ -105,11 +107,12 @@ def test_every_option_has_its_sentence() -> None:
 
 
 def test_the_effective_options_are_read_back_as_they_were(tmp_path: Path) -> None:
-    changed = with_overrides(Config(), {"match.max_depth_mm": "900", "match.max_size_ratio": "inf"})
+    changed = with_overrides(Config(), {"match.max_depth_mm": "900", "match.max_size_ratio": "1e9"})
     assert changed != Config()
     path = tmp_path / "options.toml"
     path.write_text(to_toml(changed), encoding="utf-8")
     assert read_config(path) == changed
+    assert read_config(str(path)) == changed
 
 
 def test_overrides_need_no_quotes_and_take_effect_together() -> None:

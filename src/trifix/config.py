@@ -13,6 +13,7 @@ import tomllib
 from collections.abc import Mapping
 from dataclasses import Field, dataclass, field, fields, is_dataclass, replace
 from functools import cache
+from math import isfinite
 from pathlib import Path
 from typing import ClassVar, Literal, Protocol, TypeVar, get_args, get_origin, get_type_hints, runtime_checkable
 
@@ -76,13 +77,13 @@ class Config:
     """What becomes of frames that nothing connects to the map."""
 
 
-def read_config(path: Path) -> Config:
+def read_config(path: Path | str) -> Config:
     """The options of a TOML file; what it leaves out keeps its default.
 
     Raises:
         ConfigError: the file cannot be read, or holds an unknown key or an impossible value.
     """
-    text = read_text(path, ConfigError)
+    text = read_text(Path(path), ConfigError)
     try:
         values = tomllib.loads(text)
     except tomllib.TOMLDecodeError as error:
@@ -104,6 +105,7 @@ def paper_options(technique: Technique = "frequency") -> Config:
             tolerance_mm=0.4,
             portion=1_000_000_000,
             max_hypotheses=1_000_000,
+            widens=False,
         ),
         verify=VerifyOptions(method="residual", max_residual_mm=0.5),
         update=UpdateOptions(method="kalman", max_misses=0),
@@ -175,9 +177,12 @@ def sentences(options: type) -> dict[str, str]:
 
 def _converted(value: object, expected: object, source: str, key: str) -> object:
     try:
-        return msgspec.convert(value, type=expected)
-    except msgspec.ValidationError as error:
+        converted: object = msgspec.convert(value, type=expected)
+    except (msgspec.ValidationError, OverflowError) as error:
         raise ConfigError(f"{source}: {key} is {_shown(value)}, expected {_described(expected)}.") from error
+    if isinstance(converted, float) and not isfinite(converted):
+        raise ConfigError(f"{source}: {key} is {_shown(value)}, expected a finite number.")
+    return converted
 
 
 def _suggestion(name: str, known: list[str], section: str) -> str:

@@ -8,6 +8,7 @@ import cv2
 import numpy as np
 import pytest
 
+from trifix.errors import ConfigError
 from trifix.kernels import detection
 from trifix.records import Dots
 from trifix.stages.detect import DetectOptions, detect
@@ -305,3 +306,28 @@ def test_real_dots_are_found(
             assert np.mean(distance < 1) >= recall
             assert np.sqrt(np.mean(distance[distance < 1] ** 2)) < rms_px
             assert len(dots) <= most
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "text"),
+    [
+        ("min_diameter_px", 0.0, "detect.min_diameter_px is 0.0, expected more than 0 and less than"),
+        (
+            "max_diameter_px",
+            3.0,
+            "detect.min_diameter_px is 3.5, expected more than 0 and less than max_diameter_px = 3",
+        ),
+        ("min_diameter_px", float("nan"), "detect.min_diameter_px is nan, expected"),
+        ("min_axis_ratio", 1.1, "detect.min_axis_ratio is 1.1, expected a fraction above 0 and at most 1."),
+        ("min_contrast", -3.0, "detect.min_contrast is -3.0, expected a fraction above 0 and at most 1."),
+        ("max_misfit", 0.0, "detect.max_misfit is 0.0, expected a fraction above 0 and at most 1."),
+    ],
+)
+def test_impossible_options_are_refused(name: str, value: float, text: str) -> None:
+    with pytest.raises(ConfigError) as caught:
+        DetectOptions(**{name: value})  # type: ignore[arg-type]
+    assert text in str(caught.value)
+
+
+def test_options_may_be_left_out() -> None:
+    assert len(detect(np.full((40, 60), 100, dtype=np.uint8))) == 0
