@@ -483,6 +483,14 @@ def test_results_of_another_recording_are_refused(tmp_path: Path) -> None:
         run.write()
     with pytest.raises(RecordingError, match="knows no frame 6 of the results; do they belong to the same recording"):
         evaluate(long.out, short.truth_folder)
+    frames = short.truth_folder / "frames_truth.csv", short.truth_folder / "trajectory.tum"
+    for file, old, new in zip(frames, ("\n5,6000000000", "\n6.000"), ("\n5,6000000001", "\n6.000000001"), strict=True):
+        text = file.read_text()
+        file.write_text(text.replace(old + "000000" * (file.suffix == ".tum"), new, 1))
+    with pytest.raises(
+        RecordingError, match=r"frames\.csv: frame 5 has time stamp 6000000000, in .*it has 6000000001;"
+    ):
+        evaluate(short.out, short.truth_folder)
     (long.out / "summary.json").unlink()
     with pytest.raises(RecordingError, match="results folder"):
         evaluate(long.out, long.truth_folder)

@@ -19,7 +19,7 @@ from trifix.errors import RecordingError
 from trifix.files.images import holds_images
 from trifix.files.maps import read_map
 from trifix.files.recordings import LEVELS, Level, Recording, read_recording
-from trifix.files.tables import read_table
+from trifix.files.tables import Table, read_table
 from trifix.files.trajectories import read_poses
 from trifix.files.truth import Truth, read_truth
 from trifix.geometry.alignment import align, align_weighted, spread_off_line_mm
@@ -378,7 +378,7 @@ def evaluate(
     Raises:
         RecordingError: a file is missing or broken, or results and truth are not of one recording.
     """
-    results = read_table(out / "frames.csv", {"frame": int, "status": str}, {"reason": str})
+    results = read_table(out / "frames.csv", {"frame": int, "timestamp_ns": int, "status": str}, {"reason": str})
     is_positioned = results["status"] == "positioned"
     reasons = results.get("reason", np.full(len(is_positioned), "", dtype=object))
     frame, _, estimated, cov = read_poses(out / "poses.csv")
@@ -390,6 +390,7 @@ def evaluate(
     source = _recording_beside(truth, level) if recording is None else read_recording(recording, level)
 
     true_poses = _true_poses(known, frame)
+    _refuse_other_times(out / "frames.csv", results, known)
     errors = compare_poses(estimated, true_poses, is_map_given=is_map_given, wrong_mm=wrong_mm, wrong_deg=wrong_deg)
     labelled, labels = _labels(out, level, source, known)
     sightings = _read_sightings(out / "sightings.csv", labels)
@@ -475,6 +476,17 @@ def _true_poses(truth: Truth, frames: Int[np.ndarray, "n"]) -> list[Pose]:
                 f"{truth.path} knows no frame {frame} of the results; do they belong to the same recording?"
             )
     return [truth.frames.T_map_sensor[row_of[frame]] for frame in frames.tolist()]
+
+
+def _refuse_other_times(file: Path, results: Table, truth: Truth) -> None:
+    """Refuses results whose frames were taken at other times than the true ones of the same number."""
+    true_ns = dict(zip(truth.frames.index.tolist(), truth.frames.timestamp_ns.tolist(), strict=True))
+    for frame, stamp in zip(results["frame"].tolist(), results["timestamp_ns"].tolist(), strict=True):
+        if true_ns.get(frame, stamp) != stamp:
+            raise RecordingError(
+                f"{file}: frame {frame} has time stamp {stamp}, in {truth.path} it has {true_ns[frame]}; do they "
+                f"belong to the same recording?"
+            )
 
 
 def _labels(
