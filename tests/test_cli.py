@@ -2,6 +2,8 @@
 
 import csv
 import io
+import json
+import os
 import shutil
 import signal
 import subprocess
@@ -123,6 +125,11 @@ def test_a_usage_error_is_one_sentence_and_code_2(arguments: list[str], text: st
             ["run", SMALL / "recording", "-o", "out", "--sigma-px", "-1"],
             "command line: noise.sigma_px is -1.0, expected",
         ),
+        (["run", SMALL / "recording", "-o", "out", "--sigma-px", "nan"], "noise.sigma_px is nan, expected a finite"),
+        (
+            ["config", "--set", "detect.min_contrast=-3"],
+            "command line: detect.min_contrast is -3.0, expected a fraction",
+        ),
         (["config", "--set", "match.max_dept_mm=900"], "did you mean match.max_depth_mm?"),
         (["config", "--set", "detect.polarity=green"], '"green", expected one of "auto", "dark", "bright".'),
         (["simulate", "hed", "-o", "out"], "did you mean 'head'?"),
@@ -173,6 +180,79 @@ def test_results_are_compared_with_the_truth(room: Path) -> None:
     done = trifix("evaluate", room / "results", SMALL / "truth")
     assert done.code == 0, done.stderr
     assert "misidentified" in done.stdout
+
+
+def test_what_counts_as_wrong_can_be_said(room: Path) -> None:
+    done = trifix("evaluate", room / "results", SMALL / "truth", "--wrong-mm", 7, "--wrong-deg", 0.25)
+    assert done.code == 0, done.stderr
+    assert "7 mm or 0.25°" in done.stdout
+
+
+@pytest.mark.parametrize("limit", ["--wrong-mm", "--wrong-deg"])
+@pytest.mark.parametrize("value", ["0", "nan", "inf"])
+def test_an_impossible_limit_is_a_usage_error(limit: str, value: str) -> None:
+    done = trifix("evaluate", "results", "truth", limit, value)
+    assert (done.code, done.stdout) == (2, "")
+    assert done.stderr == "trifix: --wrong-mm and --wrong-deg must be positive and finite.\n"
+
+
+def test_a_given_map_without_targets_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "map.csv").write_text("id,x_mm,y_mm,z_mm\n", encoding="utf-8")
+    done = trifix("run", SMALL / "recording", "-o", tmp_path / "out", "--map", tmp_path / "map.csv")
+    assert done.code == 1
+    assert f"{tmp_path / 'map.csv'}: found no target, expected at least three; choose" in done.stderr
+
+
+def test_the_summary_knows_the_name_of_the_folder_one_is_in(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(SMALL / "recording")
+    assert trifix("run", ".", "-o", tmp_path / "out").code == 0
+    assert json.loads((tmp_path / "out" / "summary.json").read_text(encoding="utf-8"))["recording"] == "recording"
+
+
+def test_compiled_code_goes_among_temporary_files_only_where_it_has_no_other_place(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("NUMBA_CACHE_DIR", "unset")
+    monkeypatch.delenv("NUMBA_CACHE_DIR")
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
+    cli._find_room_for_compiled_code()
+    assert "NUMBA_CACHE_DIR" not in os.environ
+    monkeypatch.setattr(cli, "_can_be_written", lambda folder: False)
+    cli._find_room_for_compiled_code()
+    room = Path(os.environ.pop("NUMBA_CACHE_DIR"))
+    assert (room.parent, room.stat().st_mode & 0o077) == (tmp_path, 0)
+    room.chmod(0o777)  # somebody else could have put code there
+    cli._find_room_for_compiled_code()
+    assert Path(os.environ["NUMBA_CACHE_DIR"]) != room
+    assert Path(os.environ["NUMBA_CACHE_DIR"]).parent == tmp_path
+
+
+def test_a_folder_can_be_written_if_its_nearest_parent_can(tmp_path: Path) -> None:
+    assert cli._can_be_written(tmp_path / "a" / "b")
+    (tmp_path / "file").touch()
+    assert not cli._can_be_written(tmp_path / "file" / "b")
+
+
+def test_an_interrupt_is_found_behind_other_errors() -> None:
+    inner, outer = ValueError(), SystemError()
+    inner.__context__ = KeyboardInterrupt()
+    outer.__cause__ = inner
+    assert cli._comes_of_interrupt(outer)
+    assert not cli._comes_of_interrupt(SystemError())
+
+
+def test_a_second_interrupt_ends_at_once() -> None:
+    program = (
+        "import signal, trifix.cli\n"
+        "with trifix.cli._between_frames():\n"
+        "    signal.raise_signal(signal.SIGINT)\n"
+        "    print('waits', flush=True)\n"
+        "    signal.raise_signal(signal.SIGTERM)\n"
+        "    print('goes on', flush=True)\n"
+    )
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stdout) == (130, "waits\n")
+    assert done.stderr == f"trifix: {cli._INTERRUPTED}\n"
 
 
 def test_a_simulated_recording_can_be_positioned(tmp_path: Path) -> None:

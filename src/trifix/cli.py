@@ -4,9 +4,11 @@ Numerics load when a function first asks for them, so that help and usage errors
 in one sentence on stderr. Exit codes: 0 complete, 1 bad input, 2 usage, 130 interrupted.
 """
 
+import math
 import os
 import shlex
 import signal
+import stat
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
@@ -30,7 +32,7 @@ from rich.table import Table
 from rich.text import Text
 
 import trifix
-from trifix.errors import TrifixError
+from trifix.errors import MapError, TrifixError
 
 app = App(
     name="trifix",
@@ -119,6 +121,8 @@ def run(
         is_paper=paper,
     )
     given = None if map_ is None else trifix.read_map(map_)
+    if given is not None and not len(given):
+        raise MapError(f"{map_}: found no target, expected at least three; choose another map or none.")
     frames = trifix.read_recording(recording, level, options.noise.sigma_px)
     _position(
         frames, out, options, given, is_map_frozen=given is not None and map_mode != "grow", is_online=online or paper
@@ -152,16 +156,20 @@ def demo(*, out: Out = Path("demo")) -> None:
 
 
 @app.command(sort_key=3)
-def evaluate(results: Path, truth: Path, /) -> None:
+def evaluate(results: Path, truth: Path, /, *, wrong_mm: float = 3.0, wrong_deg: float = 0.5) -> None:
     """Compare results with the truth.
 
     Args:
         results: Folder that `trifix run` wrote.
         truth: Folder of the truth.
+        wrong_mm: A pose further off than this is wrong (mm).
+        wrong_deg: A pose turned by more than this is wrong (degrees).
     """
+    if not (0 < wrong_mm < math.inf and 0 < wrong_deg < math.inf):
+        raise CycloptsError(msg="--wrong-mm and --wrong-deg must be positive and finite.")
     from trifix.evaluation import table
 
-    _print_rows(table(trifix.evaluate(results, truth)))
+    _print_rows(table(trifix.evaluate(results, truth, wrong_mm=wrong_mm, wrong_deg=wrong_deg)))
 
 
 experiment = App(name="experiment", help="Repeat the paper's experiments on simulated recordings.", sort_key=4)
@@ -242,6 +250,7 @@ _INTERRUPTED = "interrupted; what was finished until then is whole."
 def main() -> None:
     """Run the command line and leave with its exit code."""
     signal.signal(signal.SIGTERM, signal.default_int_handler)  # as ctrl-C: finished results stay whole
+    _find_room_for_compiled_code()
     try:
         app(sys.argv[1:])
         sys.stdout.flush()
@@ -257,9 +266,48 @@ def main() -> None:
     except KeyboardInterrupt:
         _leave(_INTERRUPTED, 130)
     except SystemError as error:  # what an interrupt inside compiled code looks like
-        if not isinstance(error.__cause__, KeyboardInterrupt):
+        if not _comes_of_interrupt(error):
             raise
         _leave(_INTERRUPTED, 130)
+
+
+def _comes_of_interrupt(error: BaseException | None) -> bool:
+    return error is not None and (
+        isinstance(error, KeyboardInterrupt)
+        or _comes_of_interrupt(error.__cause__)
+        or _comes_of_interrupt(error.__context__)
+    )
+
+
+def _find_room_for_compiled_code() -> None:
+    """Names a folder of this user among the temporary ones where neither the package's nor the user's can be written.
+
+    Only a folder that nobody else can write: what is read from it is run.
+    """
+    kernels = Path(trifix.__file__).parent / "kernels" / "__pycache__"
+    cache = Path(os.environ.get("XDG_CACHE_HOME", "~/.cache"))
+    if "NUMBA_CACHE_DIR" in os.environ or _can_be_written(kernels) or _can_be_written(_at_home(cache)):
+        return
+    import tempfile
+
+    room = Path(tempfile.gettempdir()) / f"trifix-{os.getuid()}"
+    try:
+        room.mkdir(mode=0o700, exist_ok=True)
+        found = room.lstat()
+        is_ours = stat.S_ISDIR(found.st_mode) and found.st_uid == os.getuid() and not found.st_mode & 0o022
+    except FileExistsError:
+        is_ours = False
+    os.environ["NUMBA_CACHE_DIR"] = str(room) if is_ours else tempfile.mkdtemp(prefix="trifix-")
+
+
+def _at_home(path: Path) -> Path:
+    return Path(os.path.expanduser(path))  # noqa: PTH111  (Path.expanduser fails for a user without a home)
+
+
+def _can_be_written(folder: Path) -> bool:
+    """Whether files can be made in a folder, or the folder itself where it does not exist."""
+    nearest = next(each for each in (folder.absolute(), *folder.absolute().parents) if each.exists())
+    return nearest.is_dir() and os.access(nearest, os.W_OK | os.X_OK)
 
 
 def _leave(sentence: str, code: int) -> None:
@@ -313,7 +361,9 @@ def _position(
     positioner = trifix.Positioner(options, given, is_map_frozen)
     report = trifix.Report()
     with (
-        trifix.ResultsWriter(out, recording.path.name, recording.level, to_toml(options), is_online) as results,
+        trifix.ResultsWriter(
+            out, recording.path.resolve().name, recording.level, to_toml(options), is_online
+        ) as results,
         _progress() as progress,
     ):
         with _between_frames() as stop_if_told:
@@ -344,8 +394,10 @@ def _between_frames() -> Iterator[Callable[[], None]]:
 
     def note(number: int, frame: object) -> None:
         told.append(number)
-        if len(told) > 1:
-            raise KeyboardInterrupt
+        if len(told) > 1:  # an exception would end in the middle of compiled code, print in that of a line
+            cursor = "\x1b[?25h\n" if os.isatty(2) else ""  # which the progress bar hides
+            os.write(2, f"{cursor}trifix: {_INTERRUPTED}\n".encode())
+            os._exit(130)
 
     def stop_if_told() -> None:
         if told:
