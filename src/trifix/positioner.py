@@ -60,7 +60,7 @@ class Positioner:
         is_noise_stated: bool = False,
     ) -> None:
         self.config = config or Config()
-        self.noise = NoiseScale()
+        self.noise = self._epipolar = self._residuals = NoiseScale()
         self._is_noise_stated = is_noise_stated
         if is_map_frozen and (map is None or not map.alive.any()):
             raise MapError("A frozen map without targets was given: nothing could ever be found on it.")
@@ -255,17 +255,28 @@ class Positioner:
         return events
 
     def _weigh(self, points: SensorPoints, matches: StereoMatches | None, map: ReferenceMap, fix: Fix) -> None:
-        """What identified points tell of the recording's noise: by their residuals, or their dots' epipolar ones."""
-        if matches is None:
-            options = self.config.noise
-            self._take_noise(weigh_residuals(self.noise, points, map, fix, self._is_noise_stated, options))
-        elif fix.reason is not PositionedReason.defines_world:
+        """What identified points tell of the recording's noise: by their residuals, and their dots by epipolar ones."""
+        options, is_stated = self.config.noise, self._is_noise_stated
+        now = weigh_residuals(replace(self._residuals, scale=self.noise.scale), points, map, fix, is_stated, options)
+        self._residuals = _newest(self._residuals, now)
+        if matches is not None and fix.reason is not PositionedReason.defines_world:
             self._weigh_pairs(matches.rows(points.match[fix.point]))
+        elif matches is None:
+            self._take_noise(self._residuals)
 
     def _weigh_pairs(self, matches: StereoMatches) -> None:
-        """Epipolar residuals to the recording's noise: those of identified points, or all before anything is known."""
+        """Epipolar residuals to the recording's noise: those of identified points, or all before anything is known.
+
+        They see the dots' errors across the epipolar lines alone, and a calibration that was fitted to the same dots
+        hides some of them: where the residuals on targets are larger, these count.
+        """
         gate, options = self.config.match.max_epipolar_sigmas, self.config.noise
-        self._take_noise(weigh_matches(self.noise, matches, gate, self._is_noise_stated, options))
+        now = weigh_matches(
+            replace(self._epipolar, scale=self.noise.scale), matches, gate, self._is_noise_stated, options
+        )
+        self._epipolar = _newest(self._epipolar, now)
+        is_larger = self._residuals.is_known and self._residuals.scale > self._epipolar.scale
+        self._take_noise(self._residuals if is_larger else self._epipolar)
 
     def _take_noise(self, noise: NoiseScale) -> None:
         """A new noise scale; what the maps owe to the old one follows it."""
@@ -389,6 +400,11 @@ def _reversed(frame: Frame, last_ns: int) -> Frame:
     """The same frame, refused because it is older than one already judged."""
     detail = f"It was taken at {frame.timestamp_ns} ns, after one of {last_ns} ns."
     return Frame(frame.index, frame.timestamp_ns, frame.rig, Unusable(Reason.time_reversed, detail))
+
+
+def _newest(before: NoiseScale, now: NoiseScale) -> NoiseScale:
+    """What is known now, with the scale that was last fitted."""
+    return now if now.fitted_at != before.fitted_at else replace(now, scale=before.scale)
 
 
 def _sum(first: dict[str, float], second: dict[str, float]) -> dict[str, float]:
