@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -23,6 +24,7 @@ from constellations import (
 )
 from trifix.config import Config
 from trifix.evaluation import compare_poses
+from trifix.files.recordings import read_recording
 from trifix.geometry.pose import Pose
 from trifix.positioner import Positioner
 from trifix.records import (
@@ -37,7 +39,7 @@ from trifix.records import (
     TargetState,
     Unusable,
 )
-from trifix.sources.simulation import Simulation, simulate_frames
+from trifix.sources.simulation import Simulation, simulate, simulate_frames
 from trifix.stages.verify import VerifyOptions
 
 
@@ -341,3 +343,11 @@ def test_two_runs_are_the_same_to_the_last_bit(level, frames):
         np.testing.assert_array_equal(a.target, b.target)
         for name in ReferenceMap.__slots__:
             assert getattr(one.map, name).tobytes() == getattr(other.map, name).tobytes()
+
+
+def test_a_near_regular_grid_is_positioned_throughout(tmp_path: Path) -> None:
+    """Among its many hypotheses are some that lose every pair as they are worked out (frame 268)."""
+    simulate("grid", tmp_path / "grid", "dots", 7, 500)
+    recording = read_recording(tmp_path / "grid" / "recording")
+    steps = list(Positioner().run(recording.frame(k) for k in range(275)))
+    assert all(isinstance(step.fix, Fix) for step in steps)

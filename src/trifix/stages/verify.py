@@ -326,6 +326,8 @@ def _refined(
         if keep.all():
             break
         point, target = point[keep], target[keep]
+    if len(point) < 3:
+        return None
     return Solution(T, cov, point, target, log_ratio)
 
 
