@@ -205,21 +205,6 @@ def test_the_required_proof_is_an_option():
     assert "of 12 points agree" in answer.detail
 
 
-def test_hypotheses_that_lose_all_their_pairs_are_no_solutions():
-    """Three pairs that do not fit give a pose that none of them agrees with."""
-    for seed in range(30):
-        rng = np.random.default_rng(seed)
-        world = scattered(rng, 12)
-        points = seen_points(world[:8], looking(rng), rng)
-        wrong = [
-            [(int(p), int(q)) for p, q in zip(rng.permutation(8)[:3], rng.permutation(12)[:3], strict=True)]
-            for _ in range(30)
-        ]
-        hypotheses = saying(*wrong)
-        map = front_map(world)
-        assert isinstance(verify(points, map, hypotheses, orient(points, map, hypotheses)), Fix | NoFix)
-
-
 def test_without_hypotheses_there_is_no_candidate():
     rng = np.random.default_rng(12)
     world = scattered(rng, 12)
