@@ -316,7 +316,7 @@ class Positioner:
             earlier = placed.get(k, step)
             is_first = isinstance(earlier.fix, Fix) and earlier.fix.reason is PositionedReason.defines_world
             if isinstance(earlier.fix, Fix) and earlier.points and (is_first or isinstance(step.fix, NoFix)):
-                fix = earlier.fix.moved_to(earlier.map, self.map, earlier.points)
+                fix = earlier.fix.moved_to(earlier.map, self.map, earlier.points, earlier.dots, earlier.frame.rig)
                 step = replace(earlier, fix=fix, map=self.map, elsewhere=None)
             yield replace(
                 step, frame=before.frame, events=before.events, timings_ms=_sum(before.timings_ms, step.timings_ms)

@@ -302,6 +302,48 @@ class Prediction:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class SingleDots:
+    """Dots that one camera alone saw, and the targets that they are."""
+
+    camera: Int[np.ndarray, "s"]
+    """0: left, 1: right."""
+    dot: Int[np.ndarray, "s"]
+    """Row among the dots of that camera."""
+    target: Int[np.ndarray, "s"]
+    """Row of the target that it is."""
+    residual_px: Float[np.ndarray, "s"]
+    """Distance of the dot from the image of its target (px)."""
+
+    def __len__(self) -> int:
+        return len(self.camera)
+
+    @staticmethod
+    def none() -> "SingleDots":
+        """No such dots."""
+        nothing = np.zeros(0, dtype=np.int64)
+        return SingleDots(nothing, nothing, nothing, np.zeros(0))
+
+    @staticmethod
+    def of(
+        camera: Int[np.ndarray, "s"],
+        dot: Int[np.ndarray, "s"],
+        target: Int[np.ndarray, "s"],
+        dots: StereoDots,
+        rig: StereoRig,
+        T_world_sensor: Pose,
+        map: ReferenceMap,
+    ) -> "SingleDots":
+        """These dots as these targets, their residuals measured from the pose."""
+        in_left = T_world_sensor.inverse().apply(map.xyz_mm[target])
+        uv_left, uv_right = rig.left.project(in_left), rig.right.project(rig.T_right_left.apply(in_left))
+        residual_px = np.zeros(len(dot))
+        for side, (uv, seen) in enumerate(((uv_left, dots.left), (uv_right, dots.right))):
+            rows = camera == side
+            residual_px[rows] = np.linalg.norm(uv[rows] - seen.uv_px[dot[rows]], axis=1)
+        return SingleDots(camera, dot, target, residual_px)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class Fix:
     """A verified pose of the sensor."""
 
@@ -321,19 +363,40 @@ class Fix:
     """What is special about this fix."""
     detail: str = ""
     """Free text."""
+    single: SingleDots = field(default_factory=SingleDots.none)
+    """What only one camera saw of the map."""
 
     def with_targets_of(self, map: ReferenceMap) -> "tuple[Fix, ReferenceMap]":
         """The same fix on a map of its own targets alone, and that map."""
-        return replace(self, target=np.arange(len(self.target))), map.rows(self.target)
+        c, s = len(self.target), len(self.single)
+        single = replace(self.single, target=np.arange(c, c + s))
+        own = map.rows(np.concatenate([self.target, self.single.target]))
+        return replace(self, target=np.arange(c), single=single), own
 
-    def moved_to(self, targets: ReferenceMap, map: ReferenceMap, points: SensorPoints) -> "Fix":
+    def moved_to(
+        self,
+        targets: ReferenceMap,
+        map: ReferenceMap,
+        points: SensorPoints,
+        dots: StereoDots | None,
+        rig: StereoRig | None,
+    ) -> "Fix":
         """The same fix with its targets' rows in another state of the map; those that have left it are left out."""
         alive = np.flatnonzero(map.alive)
         row_of = dict(zip(map.id[alive].tolist(), alive.tolist(), strict=True))
-        rows = np.array([row_of.get(each, -1) for each in targets.id[self.target].tolist()], dtype=np.int64)
+
+        def rows_of(target: Int[np.ndarray, "c"]) -> Int[np.ndarray, "c"]:
+            return np.array([row_of.get(each, -1) for each in targets.id[target].tolist()], dtype=np.int64)
+
+        rows, single_rows = rows_of(self.target), rows_of(self.single.target)
         point, target = self.point[rows >= 0], rows[rows >= 0]
         residual = map.xyz_mm[target] - self.T_world_sensor.apply(points.xyz_mm[point])
-        return replace(self, point=point, target=target, residual_mm=np.linalg.norm(residual, axis=1))
+        single, stays = SingleDots.none(), single_rows >= 0
+        if dots is not None and rig is not None:
+            camera, dot = self.single.camera[stays], self.single.dot[stays]
+            single = SingleDots.of(camera, dot, single_rows[stays], dots, rig, self.T_world_sensor, map)
+        residual_mm = np.linalg.norm(residual, axis=1)
+        return replace(self, point=point, target=target, residual_mm=residual_mm, single=single)
 
     @property
     def rms_mm(self) -> float:

@@ -264,14 +264,18 @@ class ResultsWriter:
         left, right = step.matches.left[match], step.matches.right[match]
         px_left = _distance_px(rig.left, in_left, step.dots.left.uv_px[left])
         px_right = _distance_px(rig.right, rig.T_right_left.apply(in_left), step.dots.right.uv_px[right])
+        row = step.dots.left.row, step.dots.right.row
         if self._level == "images":  # rows of the dots.csv among the results
-            row_left, row_right = self._dots_written + left, self._dots_written + len(step.dots.left) + right
-        else:
-            row_left, row_right = step.dots.left.row[left], step.dots.right.row[right]
+            ends = self._dots_written + np.cumsum([0, len(step.dots.left), len(step.dots.right)])
+            row = np.arange(ends[0], ends[1]), np.arange(ends[1], ends[2])
         sightings = []
         for k, target in enumerate(ids):
-            sightings.append(f"{frame},left,{row_left[k]},{target},{mm[k]},{fixed(px_left[k])}")
-            sightings.append(f"{frame},right,{row_right[k]},{target},{mm[k]},{fixed(px_right[k])}")
+            sightings.append(f"{frame},left,{row[0][left[k]]},{target},{mm[k]},{fixed(px_left[k])}")
+            sightings.append(f"{frame},right,{row[1][right[k]]},{target},{mm[k]},{fixed(px_right[k])}")
+        one = fix.single
+        for camera, dot, target, px in zip(one.camera, one.dot, one.target, one.residual_px, strict=True):
+            kind = ("left", "right")[camera]
+            sightings.append(f"{frame},{kind},{row[camera][dot]},{step.map.id[target]},,{fixed(px)}")
         return sightings, np.concatenate([px_left, px_right])
 
 
