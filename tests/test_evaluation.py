@@ -11,6 +11,7 @@ from evo.core.trajectory import PosePath3D
 
 from trifix.errors import RecordingError
 from trifix.evaluation import (
+    Evaluation,
     Spread,
     compare_poses,
     compare_targets,
@@ -27,7 +28,8 @@ from trifix.files.truth import read_truth
 from trifix.geometry.alignment import align
 from trifix.geometry.camera import Camera, StereoRig
 from trifix.geometry.pose import Pose
-from trifix.records import ReferenceMap
+from trifix.records import ReferenceMap, StereoDots
+from trifix.sources.simulation import simulate, simulate_frames
 
 SIGMA_MM = 0.02
 
@@ -494,6 +496,137 @@ def test_results_of_another_recording_are_refused(tmp_path: Path) -> None:
     (long.out / "summary.json").unlink()
     with pytest.raises(RecordingError, match="results folder"):
         evaluate(long.out, long.truth_folder)
+
+
+# --- what truth alone says can be had ---------------------------------------------------------------------------------
+
+
+@dataclass
+class Simulated:
+    """A simulated recording of dots whose every frame is positioned rightly, but for those that are left out."""
+
+    folder: Path
+    n: int = 160
+    is_map_given: bool = False
+
+    def __post_init__(self) -> None:
+        simulate("statue", self.folder, "dots", 3, self.n)
+        self.simulation = simulate_frames("statue", 3, "dots", self.n)
+        self.estimated = dict(enumerate(self.simulation.scene.T_map_sensor))
+
+    def evaluate(self, is_online: bool = True) -> Evaluation:
+        out, truth = self.folder / "out", self.simulation.truth
+        out.mkdir(exist_ok=True)
+        cov, stamps = np.diag([0.2**2] * 3 + [1e-6] * 3), truth.frames.timestamp_ns.tolist()
+        poses = [POSES_HEADER] + [poses_row(k, stamps[k], T, cov) for k, T in self.estimated.items()]
+        frames = [f"{k},{stamps[k]},{'positioned' if k in self.estimated else 'refused'}," for k in range(self.n)]
+        sightings = []
+        for k in self.estimated:
+            dots = self.simulation.frames[k].content
+            assert isinstance(dots, StereoDots)
+            for kind, one in (("left", dots.left), ("right", dots.right)):
+                sightings += [f"{k},{kind},{row},{truth.label[row]},," for row in one.row if truth.label[row] >= 0]
+        for name, lines in {
+            "poses.csv": poses,
+            "frames.csv": ["frame,timestamp_ns,status,reason", *frames],
+            "sightings.csv": ["frame,kind,row,target,residual_mm,residual_px", *sightings],
+            "summary.json": [json.dumps({"level": "dots", "is_online": is_online})],
+        }.items():
+            (out / name).write_text("\n".join(lines) + "\n")
+        targets = truth.targets
+        cov_mm2 = np.tile(np.eye(3) * SIGMA_MM**2, (len(targets), 1, 1))
+        write_map(ReferenceMap.given(targets.xyz_mm, cov_mm2, id=targets.id), out / "map.csv")
+        return evaluate(out, self.folder / "truth", is_map_given=self.is_map_given)
+
+    def shared(self) -> tuple[np.ndarray, np.ndarray]:
+        """Per frame, what is seen by both cameras of the map that truth lets grow, and what by one of them."""
+        truth = self.simulation.truth
+        mapped = np.full(len(truth.targets), self.is_map_given)
+        both, single = [], []
+        for k, row in enumerate(truth.seen_both):
+            both.append(row & mapped)
+            single.append((truth.seen_left[k] ^ truth.seen_right[k]) & mapped)
+            if truth.frames.reachable_online[k] and not self.is_map_given:
+                mapped = mapped | row
+        return np.array(both), np.array(single)
+
+
+@pytest.fixture(scope="module")
+def simulated(tmp_path_factory: pytest.TempPathFactory) -> Simulated:
+    return Simulated(tmp_path_factory.mktemp("simulated"))
+
+
+@pytest.mark.parametrize("is_map_given", [False, True])
+def test_what_a_frame_shares_with_the_true_map_is_counted_by_targets_and_equations(
+    simulated: Simulated, is_map_given: bool
+) -> None:
+    run = copy.copy(simulated)
+    run.is_map_given = is_map_given
+    both, single = run.shared()
+    few = (run.simulation.truth.seen_both.sum(axis=1) < 3) & (3 * both.sum(axis=1) + 2 * single.sum(axis=1) >= 7)
+    assert few.sum() > 3
+    e = run.evaluate()
+    assert e.of_online4.count == e.of_online4.of == (both.sum(axis=1) >= 4).sum() > 50
+    assert e.of_online3.count == e.of_online3.of == (both.sum(axis=1) == 3).sum() > 0
+    assert e.of_few.count == e.of_few.of == few.sum()
+
+    run.estimated = {k: T for k, T in run.estimated.items() if not few[k] and both[k].sum() < 6}
+    e = run.evaluate()
+    assert e.of_few.count == 0
+    assert e.of_few.of == few.sum()
+    assert e.of_online4.count == np.isin(both.sum(axis=1), [4, 5]).sum() < e.of_online4.of
+
+
+def test_three_targets_count_soon_after_a_fix_alone(simulated: Simulated) -> None:
+    run = copy.copy(simulated)
+    both, _ = run.shared()
+    three = np.flatnonzero(both.sum(axis=1) == 3).tolist()
+    run.estimated = {k: T for k, T in run.estimated.items() if k not in three}
+    soon = [k for k in three if any(j in run.estimated for j in range(k - 4, k))]  # 50 ms from frame to frame
+    late = copy.copy(run)
+    late.estimated = {k: T for k, T in run.estimated.items() if not any(k < j <= k + 4 for j in three)}
+    assert soon
+    assert (run.evaluate().of_online3.count, run.evaluate().of_online3.of) == (0, len(soon))
+    assert late.evaluate().of_online3.of == 0
+
+
+def test_poses_of_few_points_are_judged_by_their_single_dots(simulated: Simulated) -> None:
+    run = copy.copy(simulated)
+    truth = run.simulation.truth
+    both, single = truth.seen_both.sum(axis=1), (truth.seen_left ^ truth.seen_right).sum(axis=1)
+    few = np.flatnonzero((both < 3) & (3 * both + 2 * single >= 7)).tolist()
+    unlabelled = int((3 * both + 2 * single < 7).sum())
+    e = run.evaluate()
+    assert (e.wrong, e.unlabelled) == (0, unlabelled)
+    run.estimated = run.estimated | {few[0]: run.estimated[few[0]] @ Pose.exp(np.array([0, 15.0, 15.0, 0, 0, 0]))}
+    e = run.evaluate()
+    assert (e.wrong, e.misidentified, e.drifted, e.unlabelled) == (1, (few[0],), 0, unlabelled)
+
+
+def test_single_dots_taken_for_another_target_are_wrong_sightings(simulated: Simulated) -> None:
+    run = copy.copy(simulated)
+    whole = run.evaluate()
+    assert whole.sightings.count == whole.sightings.of
+    truth = run.simulation.truth
+    k = int(np.argmax((truth.seen_left ^ truth.seen_right).any(axis=1)))
+    alone = int(np.argmax(truth.seen_left[k] ^ truth.seen_right[k]))
+    file = run.folder / "out" / "sightings.csv"
+    lines = file.read_text().splitlines()
+    at = next(i for i, line in enumerate(lines) if line.startswith(f"{k},") and line.split(",")[3] == str(alone))
+    lines[at] = ",".join([*lines[at].split(",")[:3], str((alone + 1) % len(truth.targets)), "", "0.1"])
+    file.write_text("\n".join(lines) + "\n")
+    e = evaluate(run.folder / "out", run.folder / "truth", is_map_given=False)
+    assert (e.sightings.count, e.sightings.of) == (whole.sightings.count - 1, whole.sightings.of)
+
+
+def test_the_table_shows_online_rates_for_online_runs_alone(simulated: Simulated) -> None:
+    online, offline = (dict(table(simulated.evaluate(is_online))) for is_online in (True, False))
+    only = {
+        "positioned of those sharing four or more with the true map",
+        "positioned of those sharing three, within 0.2 s of a fix",
+    }
+    assert set(online) - set(offline) == only
+    assert "positioned of those with few points, but dots enough" in offline
 
 
 # --- on real recordings ----------------------------------------------------------------------------------------------

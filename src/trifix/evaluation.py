@@ -22,7 +22,7 @@ from trifix.files.recordings import LEVELS, Level, Recording, read_recording
 from trifix.files.tables import Table, read_table
 from trifix.files.trajectories import read_poses
 from trifix.files.truth import Truth, read_truth
-from trifix.geometry.alignment import align, align_weighted, spread_off_line_mm
+from trifix.geometry.alignment import align, align_weighted, point_jacobian, spread_off_line_mm
 from trifix.geometry.camera import StereoRig
 from trifix.geometry.pose import Pose
 from trifix.records import (
@@ -40,6 +40,10 @@ SIGMAS = 5.0
 """A wrong pose that is nearer than this to the pose of the true labels is drift, not misidentification."""
 LINE_RMS_MM = 3.0
 """Targets lie on one line if they are nearer to it than this (mm rms)."""
+SOON_S = 0.2
+"""A frame so little after a fix may be positioned by three targets, as the motion speaks too."""
+FEW_EQUATIONS = 7
+"""As many equations overdetermine a pose, be they of fewer than three points and of dots of a single camera."""
 NEAR_PX = 2.0
 """A detected dot is the nearest imaged target within this distance (px)."""
 
@@ -138,6 +142,8 @@ class Evaluation:
     """Frames without, per reason."""
     is_map_given: bool
     """Poses were compared in the coordinates of the given map, without alignment."""
+    is_online: bool
+    """Every frame was judged by what was known at its time."""
     of_positionable: Share
     """Positioned frames, of those with three targets seen by both cameras here and in two earlier frames."""
     of_reachable_online: Share
@@ -146,6 +152,14 @@ class Evaluation:
     """Positioned frames, of those linked in any order."""
     of_sharing: Share
     """Positioned frames, of those that share three targets not on one line with the program's own map as of then."""
+    of_online4: Share
+    """Positioned frames, of those that share four targets or more, not on one line, with the map as of then that truth
+    lets grow: from the first usable frame, by every frame that shares three. A given map is whole from the start."""
+    of_online3: Share
+    """Positioned frames, of those that share exactly three with it, within ``SOON_S`` of the last positioned frame."""
+    of_few: Share
+    """Positioned frames, of those with fewer than three points, but ``FEW_EQUATIONS`` equations or more on targets of
+    that map which are not on one line: three for a target that both cameras saw, two for one that one of them saw."""
     wrong: int
     """Poses off truth by more than the limits."""
     wrong_mm: float
@@ -158,7 +172,8 @@ class Evaluation:
     drifted: int
     """Wrong poses that are not misidentified."""
     unlabelled: int
-    """Poses of frames with too few true labels for a pose: these are misidentified when wrong against truth."""
+    """Poses of frames with too few true labels for a pose, single dots among them: these are misidentified when wrong
+    against truth."""
     error_mm: Spread
     """Position against truth, all positioned frames (mm)."""
     error_deg: Spread
@@ -200,6 +215,8 @@ def table(evaluation: Evaluation) -> list[tuple[str, str]]:
         ("positioned of reachable online", str(e.of_reachable_online)),
         ("positioned of reachable offline", str(e.of_reachable_offline)),
         ("positioned of those sharing three targets with the map", str(e.of_sharing)),
+        *(_online_rows(e) if e.is_online else ()),
+        ("positioned of those with few points, but dots enough", str(e.of_few)),
         (f"wrong poses (beyond {limits})", str(e.wrong)),
         ("misidentified", str(len(e.misidentified))),
         ("drifted", str(e.drifted)),
@@ -221,6 +238,14 @@ def table(evaluation: Evaluation) -> list[tuple[str, str]]:
         ("targets twice in the map", str(e.duplicates)),
         ("targets of the map that are none", str(e.unknown_targets)),
         ("target error, median · rms · worst", _figures(e.target_mm, "mm")),
+    ]
+
+
+def _online_rows(e: Evaluation) -> list[tuple[str, str]]:
+    """What the whole recording, where a run may use it, would turn round: a later frame can help an earlier one."""
+    return [
+        ("positioned of those sharing four or more with the true map", str(e.of_online4)),
+        (f"positioned of those sharing three, within {SOON_S:g} s of a fix", str(e.of_online3)),
     ]
 
 
@@ -349,6 +374,18 @@ class _Labelled:
     id: Int[np.ndarray, "p"]
     xyz_mm: Float[np.ndarray, "p 3"]
     cov_mm2: Float[np.ndarray, "p 3 3"]
+    single: "_LabelledDots | None" = None
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _LabelledDots:
+    """Dots of targets that one camera alone saw, of which it is known which they are."""
+
+    rig: StereoRig
+    camera: Int[np.ndarray, "d"]
+    id: Int[np.ndarray, "d"]
+    uv_px: Float[np.ndarray, "d 2"]
+    cov_px2: Float[np.ndarray, "d 2 2"]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -385,7 +422,7 @@ def evaluate(
     targets = read_map(out / "map.csv")
     if is_map_given is None:
         is_map_given = len(targets) > 0 and PositionedReason.defines_world.name not in reasons
-    level = _level_of(out)
+    level, is_online = _level_of(out)
     known = read_truth(truth)
     source = _recording_beside(truth, level) if recording is None else read_recording(recording, level)
 
@@ -397,7 +434,7 @@ def evaluate(
     true_xyz_mm = dict(zip(known.targets.id.tolist(), known.targets.xyz_mm, strict=True))
     identity = _identities(targets, sightings, true_xyz_mm, wrong_mm if is_map_given else None)
     is_misidentified, is_judged = _misidentified(
-        frame, estimated, errors, targets, identity, labelled, wrong_mm, wrong_deg
+        frame, estimated, true_poses, errors, targets, identity, labelled, wrong_mm, wrong_deg
     )
     is_right = ~is_misidentified
 
@@ -415,17 +452,26 @@ def evaluate(
         return Share(len(which & positioned), len(which))
 
     index = known.frames.index
+    shared = _shared_with_truth(
+        known, labelled, true_xyz_mm, set(identity.values()) & set(true_xyz_mm) if is_map_given else None
+    )
     return Evaluation(
         frames=len(judged),
         positioned=len(positioned),
         refused=dict(Counter(reasons[~is_positioned].tolist()).most_common()),
         is_map_given=is_map_given,
+        is_online=is_online,
         of_positionable=share_of(index[known.frames.positionable].tolist()),
         of_reachable_online=share_of(index[known.frames.reachable_online].tolist()),
         of_reachable_offline=share_of(index[known.frames.reachable_offline].tolist()),
         of_sharing=share_of(
             _sharing(labelled, sightings, set(identity.values()) if is_map_given else set(), true_xyz_mm)
         ),
+        of_online4=share_of(frame for frame, each in shared.items() if each.both >= 4),
+        of_online3=share_of(
+            {frame for frame, each in shared.items() if each.both == 3} & _soon(results, is_positioned)
+        ),
+        of_few=share_of(frame for frame, each in shared.items() if each.is_few),
         wrong=int(errors.is_wrong.sum()),
         wrong_mm=wrong_mm,
         wrong_deg=wrong_deg,
@@ -446,16 +492,17 @@ def evaluate(
     )
 
 
-def _level_of(out: Path) -> Level:
-    """The level at which the run began."""
+def _level_of(out: Path) -> tuple[Level, bool]:
+    """The level at which the run began, and whether it judged every frame by what was known at its time."""
     file = out / "summary.json"
     try:
-        level = json.loads(file.read_text(encoding="utf-8")).get("level")
+        summary = json.loads(file.read_text(encoding="utf-8"))
+        level, is_online = summary.get("level"), summary.get("is_online") is True
     except (OSError, ValueError) as fault:
         raise RecordingError(f"{file} cannot be read ({fault}); is {out} a results folder?") from fault
     for known in LEVELS:
         if level == known:
-            return known
+            return known, is_online
     raise RecordingError(f"{file}: found level {level!r}, expected one of {', '.join(LEVELS)}.")
 
 
@@ -544,7 +591,25 @@ def _triangulated(
     left, right = left[ids >= 0], right[ids >= 0]
     unused = np.zeros(len(left))
     points = triangulate(dots, StereoMatches(left, right, unused, unused), rig)
-    return _once_each(points, label_left[left[points.match]])
+    single = [
+        (np.full(len(own), camera), own, seen.uv_px[row], seen.cov_px2[row])
+        for camera, (seen, label, other) in enumerate(
+            ((dots.left, label_left, label_right), (dots.right, label_right, label_left))
+        )
+        for own, row in [_unshared(label, other)]
+    ]
+    camera, own, uv_px, cov_px2 = (np.concatenate(column) for column in zip(*single, strict=True))
+    seen_by_one = _LabelledDots(rig, camera, own, uv_px, cov_px2)
+    return replace(_once_each(points, label_left[left[points.match]]), single=seen_by_one)
+
+
+def _unshared(
+    label: Int[np.ndarray, "n"], other: Int[np.ndarray, "m"]
+) -> tuple[Int[np.ndarray, "d"], Int[np.ndarray, "d"]]:
+    """The targets among one camera's labels that are not among the other's, and the row of each."""
+    ids, row = np.unique(label, return_index=True)
+    own = (ids >= 0) & ~np.isin(ids, other)
+    return ids[own], row[own]
 
 
 def _detected(file: Path, source: Recording) -> list[tuple[int, StereoRig | None, StereoDots]]:
@@ -658,9 +723,66 @@ def _sharing(
             yield frame
 
 
+@dataclass(frozen=True, slots=True)
+class _Shared:
+    """What one frame has in common with the map that truth lets grow."""
+
+    both: int
+    """Targets seen by both cameras, if they are not on one line; else 0."""
+    is_few: bool
+    """Fewer than three points, and equations enough."""
+
+
+def _shared_with_truth(
+    truth: Truth,
+    labelled: Mapping[int, _Labelled],
+    true_xyz_mm: Mapping[int, Float[np.ndarray, "3"]],
+    given: set[int] | None,
+) -> dict[int, _Shared]:
+    """Of each frame after the one that founds the map, what it shares with it; the same process as reachable_online.
+
+    Without a given map, it starts with the first frame that shows three targets not on one line, and takes in all
+    targets that both cameras see in a frame which shares three such with it.
+    """
+
+    def spans(ids: Iterable[int]) -> bool:
+        return spread_off_line_mm(np.array([true_xyz_mm[i] for i in ids]).reshape(-1, 3)) >= LINE_RMS_MM
+
+    shared: dict[int, _Shared] = {}
+    mapped = set(given or ())
+    for frame in truth.frames.index.tolist():
+        points = labelled.get(frame)
+        if points is None:
+            continue
+        both = set(points.id.tolist())
+        if mapped:
+            single = set() if points.single is None else set(points.single.id.tolist())
+            near, alone = both & mapped, single & mapped
+            equations = 3 * len(near) + 2 * len(alone)
+            is_few = len(both) < 3 and equations >= FEW_EQUATIONS and spans(near | alone)
+            shared[frame] = _Shared(len(near) if spans(near) else 0, is_few)
+        if given is None and spans(both & mapped if mapped else both):
+            mapped |= both
+    return shared
+
+
+def _soon(results: Table, is_positioned: Bool[np.ndarray, "n"]) -> set[int]:
+    """Frames within ``SOON_S`` of the positioned frame that came last before them."""
+    soon: set[int] = set()
+    last_ns = -math.inf
+    for frame, stamp, fixed in zip(
+        results["frame"].tolist(), results["timestamp_ns"].tolist(), is_positioned, strict=True
+    ):
+        if stamp - last_ns <= SOON_S * 1e9:
+            soon.add(frame)
+        last_ns = stamp if fixed else last_ns
+    return soon
+
+
 def _misidentified(
     frames: Int[np.ndarray, "n"],
     estimated: Sequence[Pose],
+    truth: Sequence[Pose],
     errors: PoseErrors,
     targets: ReferenceMap,
     identity: Mapping[int, int],
@@ -673,13 +795,18 @@ def _misidentified(
     for row in np.argsort(targets.sightings, kind="stable"):
         row_of[identity.get(int(targets.id[row]), -1)] = int(row)
     row_of.pop(-1, None)
-    by_label: list[tuple[Pose, Float[np.ndarray, "6 6"], float] | None] = []
-    for frame in frames.tolist():
+    by_label: list[_LabelPose | None] = []
+    for frame, T_true in zip(frames.tolist(), truth, strict=True):
         points = labelled.get(frame)
-        pairs = [] if points is None else [(k, row_of[i]) for k, i in enumerate(points.id.tolist()) if i in row_of]
-        by_label.append(
-            None if points is None else _pose_of_labels(points, targets, np.array(pairs).reshape(-1, 2), wrong_mm)
-        )
+        if points is None:
+            by_label.append(None)
+            continue
+        pairs = _pairs(points.id, row_of)
+        fit = _pose_of_labels(points, targets, pairs, wrong_mm)
+        if fit is None and points.single is not None:
+            near = errors.T_truth_world.inverse() @ T_true
+            fit = _pose_of_few_labels(points, points.single, targets, pairs, _pairs(points.single.id, row_of), near)
+        by_label.append(fit)
     # the noise of the points may be stated wrongly: what the true labels leave over says by how much
     looseness = [fit[2] for fit in by_label if fit is not None and np.isfinite(fit[2])]
     variance = float(np.median(looseness)) if looseness else 1.0
@@ -697,9 +824,18 @@ def _misidentified(
     return is_misidentified, is_judged
 
 
+def _pairs(ids: Int[np.ndarray, "n"], row_of: Mapping[int, int]) -> Int[np.ndarray, "c 2"]:
+    """Rows of true targets, and of the same in the program's map, of those that stand in it."""
+    pairs = [(k, row_of[i]) for k, i in enumerate(ids.tolist()) if i in row_of]
+    return np.array(pairs, dtype=np.int64).reshape(-1, 2)
+
+
+_LabelPose = tuple[Pose, Float[np.ndarray, "6 6"], float]
+
+
 def _pose_of_labels(
     points: _Labelled, targets: ReferenceMap, pairs: Int[np.ndarray, "c 2"], wrong_mm: float
-) -> tuple[Pose, Float[np.ndarray, "6 6"], float] | None:
+) -> _LabelPose | None:
     """The pose that the true labels give against the program's map, its covariance, and chi-square per freedom.
 
     Targets that the map by itself has in a wrong place (more than ``wrong_mm``, and five medians, from where the
@@ -721,3 +857,52 @@ def _pose_of_labels(
     r = T.apply(b) - a
     chi2 = float(np.einsum("ni,ni->", r, np.linalg.solve(T.R @ C_b @ T.R.T + C_a, r[:, :, None])[:, :, 0]))
     return T, cov, chi2 / (3 * len(b) - 6)
+
+
+def _pose_of_few_labels(
+    points: _Labelled,
+    dots: _LabelledDots,
+    targets: ReferenceMap,
+    pairs: Int[np.ndarray, "c 2"],
+    single: Int[np.ndarray, "d 2"],
+    T: Pose,
+) -> _LabelPose | None:
+    """The same from points and dots of a single camera, next to the pose ``T``; None where they leave it open.
+
+    Gauss-Newton on T · exp(δ): p − x in millimetres for points, uv − π(x) in pixels for dots, x the target in sensor
+    coordinates; both move by [I, −[x]×] δ.
+    """
+    freedom = 3 * len(pairs) + 2 * len(single) - 6
+    at = targets.xyz_mm[np.concatenate([pairs[:, 1], single[:, 1]])]
+    if freedom + 6 < FEW_EQUATIONS or spread_off_line_mm(at) < LINE_RMS_MM:
+        return None
+    rig, (dot, row), camera = dots.rig, single.T, dots.camera[single[:, 0]]
+    for _ in range(10):
+        T_sensor_world = T.inverse()
+        R = T_sensor_world.R
+        x = T_sensor_world.apply(targets.xyz_mm[pairs[:, 1]])
+        parts = [
+            (
+                points.xyz_mm[pairs[:, 0]] - x,
+                point_jacobian(x),
+                points.cov_mm2[pairs[:, 0]] + R @ targets.cov_mm2[pairs[:, 1]] @ R.T,
+            )
+        ]
+        for side, one, T_camera_sensor in ((0, rig.left, Pose.identity()), (1, rig.right, rig.T_right_left)):
+            here = camera == side
+            x = T_sensor_world.apply(targets.xyz_mm[row[here]])
+            in_camera = T_camera_sensor.apply(x)
+            P = one.project_jacobian(in_camera) @ T_camera_sensor.R
+            S = dots.cov_px2[dot[here]] + P @ R @ targets.cov_mm2[row[here]] @ R.T @ np.swapaxes(P, 1, 2)
+            parts.append((dots.uv_px[dot[here]] - one.project(in_camera), P @ point_jacobian(x), S))
+        information = sum((np.einsum("nij,nik->jk", J, np.linalg.solve(S, J)) for _, J, S in parts), np.zeros((6, 6)))
+        slope = sum((np.einsum("nij,ni->j", np.linalg.solve(S, J), r) for r, J, S in parts), np.zeros(6))
+        if not np.isfinite(slope).all() or np.linalg.cond(information) > 1e14:
+            return None
+        cov = np.linalg.inv(information)
+        delta = -cov @ slope
+        if np.abs(delta).max() < 1e-9:
+            break
+        T = T @ Pose.exp(delta)
+    chi2 = sum(float(np.einsum("ni,ni->", r, np.linalg.solve(S, r[:, :, None])[:, :, 0])) for r, _, S in parts)
+    return T, cov, chi2 / freedom

@@ -6,6 +6,7 @@ import signal
 import subprocess
 import sys
 import time
+from dataclasses import replace
 from io import FileIO
 from pathlib import Path
 
@@ -20,7 +21,7 @@ from trifix.files.tables import read_table
 from trifix.files.trajectories import read_poses, read_tum
 from trifix.outputs.results import ResultsWriter
 from trifix.outputs.summary import Summary
-from trifix.records import Fix, NoFix, Reason, Step
+from trifix.records import Fix, NoFix, Reason, SingleDots, Step
 
 OPTIONS = "[match]\nmax_depth_mm = 900.0\n"
 CLOCKED = {"timings.csv", "summary.json", "report.html"}
@@ -132,6 +133,29 @@ def test_sightings_name_the_rows_of_the_level_below(run: tuple[Path, list[Step],
     distance = np.linalg.norm(uv - expected, axis=1)
     assert np.abs(distance - [float(row["residual_px"]) for row in here]).max() < 3e-6
     assert 0.05 < np.sqrt(np.mean(distance**2)) < 0.5  # 0.15 px an axis went in
+
+
+@pytest.mark.parametrize("level", ["images", "dots"])
+def test_dots_of_a_single_camera_are_sightings_too(tmp_path: Path, level: Level):
+    made = list(steps(3, level))
+    step = made[2]
+    fix = step.fix
+    assert isinstance(fix, Fix)
+    assert step.dots is not None
+    camera, dot, target = np.array([1, 0]), np.array([20, 21]), np.array([3, 7])
+    single = SingleDots.of(camera, dot, target, step.dots, rig(), fix.T_world_sensor, step.map)
+    made[2] = replace(step, fix=replace(fix, single=single))
+    written(tmp_path, level, made)
+    found = rows(tmp_path / "sightings.csv")[-2:]
+    assert [(row["frame"], row["kind"], row["residual_mm"]) for row in found] == [("2", "right", ""), ("2", "left", "")]
+    assert [int(row["target"]) for row in found] == step.map.id[target].tolist()
+    assert np.abs([float(row["residual_px"]) for row in found] - single.residual_px).max() < 1e-6
+    if level == "images":
+        table = rows(tmp_path / "dots.csv")
+        uv = np.array([[float(table[int(row["row"])][name]) for name in "uv"] for row in found])
+        assert np.abs(uv - [step.dots.right.uv_px[20], step.dots.left.uv_px[21]]).max() < 1e-5
+    else:
+        assert [int(row["row"]) for row in found] == [step.dots.right.row[20], step.dots.left.row[21]]
 
 
 def test_dots_of_an_image_recording_are_a_recording_again(tmp_path: Path):
