@@ -345,6 +345,16 @@ def test_kidnap_leaps_where_it_says_so_and_nowhere_else():
     assert leap[~flagged].max() < 60 < leap[flagged].min()
 
 
+@pytest.mark.parametrize("seed", [0, 1])
+def test_sparse_shows_few_points_but_dots_enough_in_one_frame_of_ten(seed):
+    truth = simulate_frames("sparse", seed, "dots", 500).truth
+    earlier = np.cumsum(truth.seen_both, axis=0) > truth.seen_both
+    both, single = truth.seen_both & earlier, (truth.seen_left ^ truth.seen_right) & earlier
+    few = (truth.seen_both.sum(axis=1) < 3) & (3 * both.sum(axis=1) + 2 * single.sum(axis=1) >= 7)
+    assert 50 <= few.sum() <= 150
+    assert 0.7 < truth.frames.reachable_online.mean() < 0.9
+
+
 def test_the_halves_of_mirror_mirror_each_other():
     xyz = simulate_frames("mirror", 0, "dots", 1).truth.targets.xyz_mm
     np.testing.assert_allclose(xyz[32:], xyz[:32] * [-1, 1, 1], atol=1e-9)

@@ -197,7 +197,7 @@ def _over(
     rig: StereoRig,
     rng: np.random.Generator,
     aim: Track,
-    distance_mm: float,
+    distance_mm: Float[np.ndarray, "n"] | float,
     tilt_deg: float = 14.0,
     roll_rad: Float[np.ndarray, "n"] | float = 0.0,
 ) -> list[Pose]:
@@ -443,6 +443,16 @@ def _closure(n: int, layout: np.random.Generator, hand: np.random.Generator) -> 
     return Scene(surface, _still(*surface.scatter(75, layout), n), rig, poses)
 
 
+def _sparse(n: int, layout: np.random.Generator, hand: np.random.Generator) -> Scene:
+    """A tour from afar; then a nearer one, on which the cameras share few targets, and each sees others alone."""
+    rig = _rig(baseline_mm=200, crossing_mm=700)
+    surface = _relief(900, 600)
+    targets = _still(*surface.scatter(30, layout, spacing=0.75), n)
+    s = np.arange(n) / n
+    distance = np.interp(s, [0, 0.47, 0.53, 1], [560, 560, 330, 330])
+    return Scene(surface, targets, rig, _over(rig, hand, _lanes(2 * s, (130, 770), (120, 480), 3), distance))
+
+
 def _demo(n: int, layout: np.random.Generator, hand: np.random.Generator) -> Scene:
     rig = _rig(f_px=1050, size_px=(960, 720), baseline_mm=90, crossing_mm=450)
     surface = head(230)
@@ -476,5 +486,6 @@ SCENES: dict[str, Recipe] = {
     "clutter": Recipe("a head with as many false dots as true ones", 1000, _clutter),
     "dwell": Recipe("long over one region, then over all: misleads frequency counts", 1000, _dwell),
     "closure": Recipe("once round and a little more: misleads frequency counts", 1000, _closure),
+    "sparse": Recipe("30 targets and wide gaps: often fewer than three for both cameras", 1000, _sparse),
     "demo": Recipe("a head with 44 targets, a short quiet tour, made to be rendered", 60, _demo),
 }
