@@ -15,6 +15,8 @@ from trifix.geometry.pose import Pose
 
 DistortionModel = Literal["none", "radtan", "equidistant"]
 
+_MODELS: tuple[DistortionModel, ...] = ("none", "radtan", "equidistant")
+
 
 @dataclass(frozen=True, slots=True)
 class Camera:
@@ -41,6 +43,17 @@ class Camera:
     def K(self) -> Float[np.ndarray, "3 3"]:
         """The matrix of intrinsics."""
         return np.array([[self.fu_px, 0.0, self.pu_px], [0.0, self.fv_px, self.pv_px], [0.0, 0.0, 1.0]])
+
+    @property
+    def parameters(self) -> Float[np.ndarray, "12"]:
+        """The camera in numbers, for compiled loops: its fields in their order, five coefficients.
+
+        The model is 0 for none, 1 for radtan, 2 for equidistant; coefficients that it has not are zero.
+        """
+        numbers = (self.fu_px, self.fv_px, self.pu_px, self.pv_px, self.width_px, self.height_px)
+        return np.array(
+            (*numbers, _MODELS.index(self.model), *self.coefficients, *(0.0,) * (5 - len(self.coefficients)))
+        )
 
     def project(self, xyz_mm: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 2"]:
         """Pixels of points in this camera's coordinates; NaN for points not in front of it."""
@@ -101,6 +114,12 @@ class StereoRig:
     def right_centre_mm(self) -> Float[np.ndarray, "3"]:
         """Centre of projection of the right camera, sensor coordinates."""
         return self.T_right_left.inverse().t_mm
+
+    @property
+    def parameters(self) -> Float[np.ndarray, "36"]:
+        """The rig in numbers, for compiled loops: left camera, right camera, R and t of ``T_right_left``."""
+        T = self.T_right_left
+        return np.concatenate([self.left.parameters, self.right.parameters, T.R.ravel(), T.t_mm])
 
 
 def distort(

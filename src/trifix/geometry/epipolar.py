@@ -1,4 +1,4 @@
-"""Epipolar geometry of a calibrated rig: how far two rays are from meeting, measured in pixels.
+"""Epipolar geometry of a calibrated rig: which dots of the two images lie on one another's lines.
 
 Everything happens in undistorted slopes (x/z, y/z); the essential matrix E satisfies x_rightᵀ E x_left = 0
 (Longuet-Higgins 1981; Hartley & Zisserman 2004, eq. 9.12). The paper's part P4.
@@ -23,28 +23,6 @@ def epipolar_lines(E: Float[np.ndarray, "3 3"], xy_left: Float[np.ndarray, "n 2"
     """Lines (a, b, c) with a x + b y + c = 0 in the right image of left slopes, a² + b² = 1."""
     lines = np.c_[xy_left, np.ones(len(xy_left))] @ E.T
     return np.asarray(lines / np.linalg.norm(lines[:, :2], axis=1, keepdims=True))
-
-
-def epipolar_residuals(
-    E: Float[np.ndarray, "3 3"],
-    xy_left: Float[np.ndarray, "n 2"],
-    xy_right: Float[np.ndarray, "n 2"],
-    cov_left: Float[np.ndarray, "n 2 2"],
-    cov_right: Float[np.ndarray, "n 2 2"],
-) -> tuple[Float[np.ndarray, "n"], Float[np.ndarray, "n"]]:
-    """x_rightᵀ E x_left of n pairs and its standard deviation, from the covariances of the slopes.
-
-    The ratio is the residual in sigmas; to first order it is Sampson's distance (Hartley & Zisserman, eq. 11.9).
-    """
-    h_left = np.c_[xy_left, np.ones(len(xy_left))]
-    h_right = np.c_[xy_right, np.ones(len(xy_right))]
-    line_right = h_left @ E.T
-    line_left = h_right @ E
-    value = np.einsum("ni,ni->n", h_right, line_right)
-    variance = np.einsum("ni,nij,nj->n", line_left[:, :2], cov_left, line_left[:, :2]) + np.einsum(
-        "ni,nij,nj->n", line_right[:, :2], cov_right, line_right[:, :2]
-    )
-    return value, np.sqrt(variance)
 
 
 def pairs_near_epipolar_lines(

@@ -7,11 +7,12 @@ epipolar line: the map decides later. Knows no map and no pose.
 from dataclasses import dataclass
 
 import numpy as np
+from jaxtyping import Float
 
 from trifix.errors import ConfigError
 from trifix.geometry.camera import Camera, StereoRig
-from trifix.geometry.epipolar import epipolar_residuals, essential_matrix, pairs_near_epipolar_lines
-from trifix.geometry.triangulation import midpoint
+from trifix.kernels import floats, integers
+from trifix.kernels.stereo import pair_dots, prepare_dots
 from trifix.records import Dots, StereoDots, StereoMatches
 
 
@@ -54,52 +55,30 @@ def match(
 
     ``noise_scale`` multiplies the dots' standard deviations.
     """
-    xy_left, cov_left = undistort_dots(dots.left, rig.left)
-    xy_right, cov_right = undistort_dots(dots.right, rig.right)
-    E = essential_matrix(rig)
-
-    # a wide gate first, on one matrix; then each pair by its own covariance
-    widest = max(_largest_sigma(cov_left), _largest_sigma(cov_right))
-    gate = 3.0 * noise_scale * options.max_epipolar_sigmas * widest
-    left, right = pairs_near_epipolar_lines(E, xy_left, xy_right, gate)
-    value, sigma = epipolar_residuals(E, xy_left[left], xy_right[right], cov_left[left], cov_right[right])
-    keep = np.abs(value) <= options.max_epipolar_sigmas * noise_scale * sigma
-    left, right, value, sigma = left[keep], right[keep], value[keep], sigma[keep]
-
-    xyz = midpoint(rig, xy_left[left], xy_right[right])
-    z_left, z_right = xyz[:, 2], rig.T_right_left.apply(xyz)[:, 2]
-    nearest_mm = options.min_depth_mm or rig.baseline_mm
-    farthest_mm = options.max_depth_mm or 15 * rig.baseline_mm
-    with np.errstate(invalid="ignore"):
-        keep = (np.minimum(z_left, z_right) >= nearest_mm) & (np.maximum(z_left, z_right) <= farthest_mm)
-        size_left = dots.left.diameter_px[left] * z_left / rig.left.fu_px
-        size_right = dots.right.diameter_px[right] * z_right / rig.right.fu_px
-        widest = np.log(options.max_size_ratio)  # unknown sizes pass
-        keep &= ~(np.abs(np.log(size_left / size_right)) > widest)
-        if options.target_diameter_mm:
-            for size in (size_left, size_right):
-                keep &= ~(np.abs(np.log(size / options.target_diameter_mm)) > widest)
-    keep &= ~((dots.left.label[left] >= 0) & (dots.right.label[right] >= 0)) | (
-        dots.left.label[left] == dots.right.label[right]
+    parameters = rig.parameters
+    left, right, epipolar_px, epipolar_sigma_px = pair_dots(
+        _prepared(dots.left, parameters[:12]),
+        _prepared(dots.right, parameters[12:24]),
+        floats(dots.left.ellipse),
+        floats(dots.right.ellipse),
+        integers(dots.left.label),
+        integers(dots.right.label),
+        parameters,
+        float(options.max_epipolar_sigmas),
+        float(noise_scale),
+        float(options.min_depth_mm or rig.baseline_mm),
+        float(options.max_depth_mm or 15 * rig.baseline_mm),
+        float(options.max_size_ratio),
+        float(options.target_diameter_mm),
     )
-    left, right, value, sigma = left[keep], right[keep], value[keep], sigma[keep]
-
-    # the same residual in pixels: divided by what an error of one pixel in every coordinate would make
-    J_left = rig.left.unproject_jacobian(xy_left[left])
-    J_right = rig.right.unproject_jacobian(xy_right[right])
-    _, per_px = epipolar_residuals(
-        E, xy_left[left], xy_right[right], J_left @ J_left.transpose(0, 2, 1), J_right @ J_right.transpose(0, 2, 1)
-    )
-    return StereoMatches(left=left, right=right, epipolar_px=value / per_px, epipolar_sigma_px=sigma / per_px)
+    return StereoMatches(left, right, epipolar_px, epipolar_sigma_px)
 
 
-def undistort_dots(dots: Dots, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
-    """Undistorted slopes (n, 2) of dots and their covariances (n, 2, 2)."""
-    xy = camera.unproject(dots.uv_px)
-    J = camera.unproject_jacobian(xy)
-    return xy, np.asarray(J @ dots.cov_px2 @ J.transpose(0, 2, 1))
+def undistort_dots(dots: Dots, camera: Camera) -> tuple[Float[np.ndarray, "n 2"], Float[np.ndarray, "n 2 2"]]:
+    """Undistorted slopes of dots and their covariances."""
+    prepared = _prepared(dots, camera.parameters)
+    return prepared[:, :2], prepared[:, [[2, 3], [3, 4]]]
 
 
-def _largest_sigma(cov: np.ndarray) -> float:
-    """Largest standard deviation along any axis; 0 without dots."""
-    return float(np.sqrt(np.nanmax(np.trace(cov, axis1=1, axis2=2), initial=0.0)))
+def _prepared(dots: Dots, camera: Float[np.ndarray, "12"]) -> Float[np.ndarray, "n 8"]:
+    return np.asarray(prepare_dots(floats(dots.uv_px), floats(dots.cov_px2), camera))

@@ -3,27 +3,22 @@
 import numpy as np
 
 from trifix.geometry.camera import StereoRig
-from trifix.geometry.triangulation import triangulate as triangulate_rays
+from trifix.kernels import floats, integers
+from trifix.kernels.stereo import prepare_dots, triangulate_pairs
 from trifix.records import SensorPoints, StereoDots, StereoMatches
 
 
 def triangulate(dots: StereoDots, matches: StereoMatches, rig: StereoRig, noise_scale: float = 1.0) -> SensorPoints:
     """One point a match that meets in front of both cameras; ``noise_scale`` multiplies the standard deviations."""
-    uv_left, uv_right = dots.left.uv_px[matches.left], dots.right.uv_px[matches.right]
-    xy_left, xy_right = rig.left.unproject(uv_left), rig.right.unproject(uv_right)
-    J_left, J_right = rig.left.unproject_jacobian(xy_left), rig.right.unproject_jacobian(xy_right)
-    xyz, cov = triangulate_rays(
-        rig,
-        xy_left,
-        xy_right,
-        noise_scale**2 * J_left @ dots.left.cov_px2[matches.left] @ J_left.transpose(0, 2, 1),
-        noise_scale**2 * J_right @ dots.right.cov_px2[matches.right] @ J_right.transpose(0, 2, 1),
-    )
-    good = np.flatnonzero(np.isfinite(xyz).all(axis=1) & np.isfinite(cov).all(axis=(1, 2)))
+    parameters = rig.parameters
+    left = prepare_dots(floats(dots.left.uv_px), floats(dots.left.cov_px2), parameters[:12])
+    right = prepare_dots(floats(dots.right.uv_px), floats(dots.right.cov_px2), parameters[12:24])
+    rows_left, rows_right = integers(matches.left), integers(matches.right)
+    xyz, cov, good = triangulate_pairs(left, right, rows_left, rows_right, parameters, float(noise_scale))
     return SensorPoints(
-        xyz_mm=xyz[good],
-        cov_mm2=cov[good],
+        xyz_mm=xyz,
+        cov_mm2=cov,
         match=good,
-        label=np.maximum(dots.left.label[matches.left[good]], dots.right.label[matches.right[good]]),
+        label=np.maximum(dots.left.label[rows_left[good]], dots.right.label[rows_right[good]]),
         row=np.arange(len(good)),
     )
