@@ -24,3 +24,7 @@ class ConfigError(TrifixError):
 
 class SimulationError(TrifixError):
     """A scene that does not exist or cannot be simulated as asked."""
+
+
+class AdjustmentError(TrifixError):
+    """Observations that do not determine what is to be adjusted."""
