@@ -49,7 +49,6 @@ from made_frames import (
     seen,
     strays,
 )
-from rich.console import Console
 from rich.table import Table
 
 from trifix import Config, Fix, NoFix, Positioner
@@ -90,7 +89,7 @@ def main(
     """
     config = with_overrides(Config(), dict(each.split("=", 1) for each in option))
     summary = measure(out, frames, kinds or tuple(KINDS), seed, shard, jobs, config)
-    Console().print(table(summary))
+    shards.console().print(table(summary))
     is_good = summary["wrong"] == 0 and summary["residual_alone_wrong_per_million"] >= POWER_PER_MILLION
     raise SystemExit(0 if is_good else 1)
 
@@ -129,7 +128,7 @@ def judged(task: shards.Task) -> dict[str, object]:
         fix = positioner.step(frame).fix
         match fix:
             case Fix():
-                is_right = batch.is_right(k, fix.T_world_sensor, world.map)
+                is_right = is_fix_right(batch, k, fix, world)
                 fixes[is_right] += 1
                 parts[f"{part}:{'right' if is_right else 'wrong'}"] += 1
                 (right if is_right else wrong)[decade(fix.p_chance)] += 1
@@ -141,7 +140,7 @@ def judged(task: shards.Task) -> dict[str, object]:
                             "part": part,
                             "points": int(batch.count[k]),
                             "matched": matched,
-                            "rightly": int((batch.label[k, fix.point] == fix.target).sum()),
+                            "true_pairs": batch.true_pairs(k, fix),
                             "p_chance": fix.p_chance,
                         }
                     )
@@ -174,6 +173,13 @@ def judged(task: shards.Task) -> dict[str, object]:
         "residual_wrong": by_residual[False],
         "wrong_ones": told_wrong,
     }
+
+
+def is_fix_right(batch: Batch, k: int, fix: Fix, world: World) -> bool:
+    """Whether a fix is right by the pose of the true labels, or by its pairs where these lie on a line."""
+    if batch.pose_of_labels(k, world.map) is None:
+        return batch.true_pairs(k, fix) == len(fix.point)
+    return batch.is_right(k, fix.T_world_sensor, world.map)
 
 
 def decade(p_chance: float) -> int:
@@ -397,7 +403,7 @@ def upper_per_million(events: int, trials: int) -> float:
 
 def table(summary: dict) -> Table:
     """A run at a glance."""
-    shown = Table("kind", "frames", "right", "wrong", "wrong by residual alone, per million", "refused")
+    shown = Table("kind", "frames", "right", "wrong", "wrong by residual alone\nper million", "refused")
     for name, kind in summary["kinds"].items():
         reasons = sorted(kind["reasons"].items(), key=lambda each: -each[1])
         shown.add_row(

@@ -14,7 +14,7 @@ from scipy.spatial import cKDTree
 
 from trifix.geometry.alignment import align, align_weighted, spread_off_line_mm
 from trifix.geometry.pose import Pose
-from trifix.records import Frame, ReferenceMap, SensorPoints
+from trifix.records import Fix, Frame, ReferenceMap, SensorPoints
 
 MOST = 30
 """Points of the largest frame."""
@@ -85,6 +85,10 @@ class Batch:
         r = T.apply(b) - a
         chi2 = float(np.einsum("ni,ni->", r, np.linalg.solve(T.R @ C_b @ T.R.T + C_a, r[:, :, None])[:, :, 0]))
         return T, cov, chi2 / (3 * len(b) - 6)
+
+    def true_pairs(self, k: int, fix: Fix) -> int:
+        """How many of the fix's points are the targets that it says."""
+        return int((self.label[k, fix.point] == fix.target).sum())
 
     def is_right(self, k: int, T_world_sensor: Pose, map: ReferenceMap) -> bool:
         """Whether a pose is, within the limits, the one that the frame's true labels give against the map."""

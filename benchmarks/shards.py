@@ -5,6 +5,7 @@ stood. What a shard gives depends on its number and the run's seed alone; so doe
 """
 
 import json
+import sys
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from hashlib import sha256
@@ -13,6 +14,7 @@ from pathlib import Path
 from time import perf_counter
 
 import numpy as np
+from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 import trifix
@@ -88,6 +90,11 @@ def run(
     if frames:
         progress.console.print(f"{frames} frames, {frames / (perf_counter() - start):.0f} a second")
     return {task.key: done[task.key] for task in todo}
+
+
+def console() -> Console:
+    """Where tables go; wide enough for them where there is no terminal."""
+    return Console(width=None if sys.stdout.isatty() else 120)
 
 
 def _results(left: list[Task], work: Callable[[Task], dict[str, object]], jobs: int):
