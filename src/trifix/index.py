@@ -4,17 +4,41 @@ Kept beside the map and updated in step with it, never made anew: a target that 
 whether the map holds a hundred others or a million. Finds congruent triangles; does not know what they prove.
 """
 
+from dataclasses import dataclass
+
 import numpy as np
 from jaxtyping import Float, Float32, Int, Int32
 
 from trifix.kernels import index as kernels
-from trifix.records import ReferenceMap, TargetState
+from trifix.records import ReferenceMap, SensorPoints, TargetState
 
 _ALIVE = int(TargetState.trusted)  # states up to this one are indexed
 _SAMPLE = 64  # targets from which the spacing is judged
 _SPACING_RATIO = 1.5  # a spacing that is off by more is corrected
 _SLACK_CELLS = 1 / 400  # of a cell's width: an eighth of a cell of sides, microns to tenths of a millimetre
 _FLOAT32_STEP = 2.0**-22  # anchors must not leave their slack by rounding
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Candidates:
+    """h pairs of congruent triangles, in the order of the frame's triangles."""
+
+    point: Int[np.ndarray, "h 3"]
+    """Rows of the points."""
+    target: Int[np.ndarray, "h 3"]
+    """Rows of the targets that they would be, vertex by vertex."""
+    triangle: Int[np.ndarray, "h"]
+    """Row of the frame's triangle."""
+    tried: int
+    """Triangles of the frame that were looked up."""
+    expected_by_chance: float
+    """Pairs that chance alone would bring, from how many triangles have sides not far from those looked up. True ones
+    are among these; that handedness refuses some is left aside."""
+    is_cut: bool = False
+    """True where the search was given up before its end."""
+
+    def __len__(self) -> int:
+        return len(self.point)
 
 
 class MapIndex:
@@ -27,6 +51,7 @@ class MapIndex:
         self._scaled_for = 0  # targets when the scales and the tables' sizes were chosen
         self._widest_mm2 = 0.0  # no target's covariance has a larger trace
         self._version = 0
+        self._pairs: tuple[int, kernels.PairTable] | None = None  # made at this version
 
     def follow(self, map: ReferenceMap, rows: Int[np.ndarray, "r"] | None = None) -> None:
         """Brings the index up to date with the map; ``rows`` are the only ones that may have changed, if given."""
@@ -46,6 +71,72 @@ class MapIndex:
         )
         if not self._scaled_for / 4 <= self._targets <= 2 * self._scaled_for:
             self._rescale(map)
+
+    def local(
+        self,
+        points: SensorPoints,
+        map: ReferenceMap,
+        frame_triangles: Int[np.ndarray, "t 3"],
+        max_sigmas: float,
+        tolerance_mm: float,
+        limit: int,
+    ) -> Candidates:
+        """Pairs of the frame's triangles with congruent ones among near neighbours in the map that was followed last.
+
+        Triangles are congruent when their sides agree within ``tolerance_mm`` and ``max_sigmas`` standard deviations,
+        and they are not known to be seen from different sides. Every order of vertices in which they do counts. The
+        search ends after the triangle at which ``limit`` pairs are reached.
+        """
+        found, tried, by_chance = kernels.match_local(
+            self._store,
+            frame_triangles,
+            points.xyz_mm,
+            points.cov_mm2,
+            map.xyz_mm,
+            map.cov_mm2,
+            map.view,
+            self._widest_mm2,
+            max_sigmas,
+            tolerance_mm,
+            limit,
+        )
+        return Candidates(found[:, :3], found[:, 3:6], found[:, 6], tried, by_chance)
+
+    def any(
+        self,
+        points: SensorPoints,
+        map: ReferenceMap,
+        frame_triangles: Int[np.ndarray, "t 3"],
+        max_sigmas: float,
+        tolerance_mm: float,
+        limit: int,
+        max_comparisons: int = 20_000_000,
+    ) -> Candidates:
+        """The same with any three targets of the map, however far apart; given up after so many comparisons.
+
+        Prefer ``local`` where targets lie close: this one looks at all pairs of targets that are no farther apart than
+        the frame's triangles are long, and keeps them until the next change of the index.
+        """
+        table = self._pairs_within(self._longest_mm(points, frame_triangles, max_sigmas, tolerance_mm), max_comparisons)
+        if table is None:
+            none = np.zeros((0, 3), dtype=np.int64)
+            return Candidates(none, none, none[:, 0], 0, 0.0, is_cut=True)
+        found, tried, by_chance, is_cut = kernels.match_any(
+            self._store,
+            table,
+            frame_triangles,
+            points.xyz_mm,
+            points.cov_mm2,
+            map.xyz_mm,
+            map.cov_mm2,
+            map.view,
+            self._widest_mm2,
+            max_sigmas,
+            tolerance_mm,
+            limit,
+            max_comparisons,
+        )
+        return Candidates(found[:, :3], found[:, 3:6], found[:, 6], tried, by_chance, is_cut)
 
     @property
     def grid(
@@ -72,13 +163,40 @@ class MapIndex:
 
     @property
     def bytes(self) -> int:
-        """Memory that the index takes."""
+        """Memory that the index takes, without the pairs that ``any`` keeps for a while."""
         return sum(part.nbytes for part in self._store if isinstance(part, np.ndarray))
 
     @property
     def version(self) -> int:
         """Grows whenever something is indexed anew."""
         return self._version
+
+    def _longest_mm(
+        self, points: SensorPoints, triangles: Int[np.ndarray, "t 3"], max_sigmas: float, tolerance_mm: float
+    ) -> float:
+        """How far apart two targets can be that agree with a side of the frame's triangles."""
+        if len(triangles) == 0:
+            return 0.0
+        corners = points.xyz_mm[triangles]
+        longest = np.linalg.norm(corners - corners[:, [1, 2, 0]], axis=2).max()
+        widest_mm2 = np.trace(points.cov_mm2, axis1=1, axis2=2).max() + self._widest_mm2
+        return float(longest + tolerance_mm + max_sigmas * np.sqrt(2 * widest_mm2) + 2 * self._store.slack_mm)
+
+    def _pairs_within(self, reach_mm: float, max_comparisons: int) -> kernels.PairTable | None:
+        """All pairs of targets up to this distance, None where there are too many to compare."""
+        store = self._store
+        steps = int(reach_mm / store.side_mm) + 1
+        if self._pairs and self._pairs[0] == self._version and len(self._pairs[1].start) > steps:
+            return self._pairs[1]
+        self._pairs = None
+        rows = np.flatnonzero(store.id >= 0)
+        axis = int(np.argmax(np.ptp(store.anchor[rows], axis=0))) if len(rows) else 0
+        rows = rows[np.argsort(store.anchor[rows, axis], kind="stable")]
+        start, compared = kernels.count_pairs(store.anchor, rows, axis, steps, store.side_mm, max_comparisons)
+        if compared > max_comparisons:
+            return None
+        self._pairs = self._version, kernels.list_pairs(store.anchor, rows, axis, start, store.side_mm)
+        return self._pairs[1]
 
     def _make_room(self, rows: int) -> None:
         cap = len(self._store.id)
@@ -111,6 +229,19 @@ class MapIndex:
         self._scaled_for = self._targets
         self._store = kernels.with_empty_tables(self._store, self._targets)
         kernels.link_all(self._store)
+
+
+def frame_triangles(
+    xyz_mm: Float[np.ndarray, "n 3"], cov_mm2: Float[np.ndarray, "n 3 3"], neighbours: int = kernels.NEIGHBOURS
+) -> Int[np.ndarray, "t 3"]:
+    """A frame's triangles of the kind that the index holds, among so many nearest neighbours, most promising first.
+
+    Promising are those whose sides are well known for their size: they agree with few others by chance. All points
+    take turns, so that one which is no target spoils no more than its share of any stretch.
+    """
+    triangles, vague = kernels.frame_triangles(xyz_mm, cov_mm2, neighbours)
+    triangles = triangles[np.argsort(vague, kind="stable")]
+    return np.asarray(triangles[np.argsort(kernels.turns(triangles, len(xyz_mm)), kind="stable")])
 
 
 def _spacing_mm(xyz_mm: Float[np.ndarray, "k 3"], rows: Int[np.ndarray, "a"]) -> float:

@@ -18,6 +18,9 @@ _REACH_CELLS = 4  # neighbours are sought within so many cells
 _SIDE_CELLS = 48.0  # cells of sides to one of space: few triangles in each, few cells to a look-up
 _SLENDER = 0.15  # triangles whose altitude is a smaller part of their longest side are left out
 _EDGE_ON_SINE = 0.34202014332566873  # sin 20°: nearer to edge-on the handedness of a triangle is not trusted
+_ORDERS = np.array([[0, 1, 2], [1, 2, 0], [2, 0, 1], [0, 2, 1], [2, 1, 0], [1, 0, 2]])  # even ones first
+_FIRST = np.array([i for i in range(NEIGHBOURS) for _ in range(i + 1, NEIGHBOURS)])
+_SECOND = np.array([j for i in range(NEIGHBOURS) for j in range(i + 1, NEIGHBOURS)])
 _DUE = -2  # in place of the nearest neighbour: this row's triangles are out of the table, its neighbours to be sought
 
 
@@ -103,7 +106,7 @@ def _is_owner(p, a, b, pa2, pb2, ab2):
     if not ((ab2 > pa2 or (ab2 == pa2 and p < b)) and (ab2 > pb2 or (ab2 == pb2 and p < a))):
         return False
     along = (pa2 + pb2 - ab2) / 2
-    return pa2 * pb2 - along * along >= (_SLENDER * ab2) ** 2  # |pa x pb|² = (altitude · |ab|)²
+    return pa2 * pb2 - along * along > (_SLENDER * ab2) ** 2  # |pa x pb|² = (altitude · |ab|)²
 
 
 @njit(cache=True, nogil=True)
@@ -393,6 +396,391 @@ def distances_to_third(
     return out
 
 
+# --- congruence ------------------------------------------------------------------------------------------------------
+
+
+@njit(cache=True, nogil=True)
+def _measure(xyz, cov, a, b, c, length, var):
+    """Fills the sides opposite to a, b and c and their variances uᵀ (C + C') u."""
+    for v in range(3):
+        p, q = (b, c) if v == 0 else ((c, a) if v == 1 else (a, b))
+        x, y, z = xyz[q, 0] - xyz[p, 0], xyz[q, 1] - xyz[p, 1], xyz[q, 2] - xyz[p, 2]
+        d2 = x * x + y * y + z * z
+        length[v] = np.sqrt(d2)
+        var[v] = 0.0
+        if d2 > 0:
+            P, Q = cov[p], cov[q]
+            var[v] = (
+                x * x * (P[0, 0] + Q[0, 0])
+                + y * y * (P[1, 1] + Q[1, 1])
+                + z * z * (P[2, 2] + Q[2, 2])
+                + 2 * (x * y * (P[0, 1] + Q[0, 1]) + x * z * (P[0, 2] + Q[0, 2]) + y * z * (P[1, 2] + Q[1, 2]))
+            ) / d2
+
+
+@njit(cache=True, nogil=True)
+def _handedness(xyz, towards, sign, a, b, c):
+    """Sign of the normal of (a, b, c) against the mean direction to the sensor; 0 where unknown or nearly edge-on."""
+    e0, e1, e2 = xyz[b, 0] - xyz[a, 0], xyz[b, 1] - xyz[a, 1], xyz[b, 2] - xyz[a, 2]
+    f0, f1, f2 = xyz[c, 0] - xyz[a, 0], xyz[c, 1] - xyz[a, 1], xyz[c, 2] - xyz[a, 2]
+    n0, n1, n2 = e1 * f2 - e2 * f1, e2 * f0 - e0 * f2, e0 * f1 - e1 * f0
+    t0 = sign * (towards[a, 0] + towards[b, 0] + towards[c, 0])
+    t1 = sign * (towards[a, 1] + towards[b, 1] + towards[c, 1])
+    t2 = sign * (towards[a, 2] + towards[b, 2] + towards[c, 2])
+    value = n0 * t0 + n1 * t1 + n2 * t2
+    size2 = (n0 * n0 + n1 * n1 + n2 * n2) * (t0 * t0 + t1 * t1 + t2 * t2)
+    if value * value > _EDGE_ON_SINE**2 * size2:  # False where a direction is NaN, too
+        return 1 if value > 0 else -1
+    return 0
+
+
+@njit(cache=True, nogil=True)
+def _agree(length, var, map_length, map_var, order, sigmas, floor_mm):
+    """Whether all three sides agree when vertex v of the one triangle is vertex ``order[v]`` of the other."""
+    for v in range(3):
+        w = order[v]
+        if abs(length[v] - map_length[w]) > floor_mm + sigmas * np.sqrt(var[v] + map_var[w]):
+            return False
+    return True
+
+
+@njit(cache=True, nogil=True)
+def _append(found, count, p, q, order, row):
+    """Adds a pair of triangles to the table of (three points, three targets, row), growing it where it is full."""
+    if count == len(found):
+        more = np.empty((2 * count, 7), np.int64)
+        more[:count] = found
+        found = more
+    for v in range(3):
+        found[count, v] = p[v]
+        found[count, 3 + v] = q[order[v]]
+    found[count, 6] = row
+    return found
+
+
+@njit(cache=True, nogil=True)
+def _typical_variance(store, cov):
+    """The variance of a side between two typical targets of the map, from a sample of them."""
+    total, count = 0.0, 0
+    for r in range(0, len(store.id), len(store.id) // 64 + 1):
+        if store.id[r] >= 0:
+            total += cov[r, 0, 0] + cov[r, 1, 1] + cov[r, 2, 2]
+            count += 1
+    return 2 / 3 * total / max(count, 1)
+
+
+# --- local triangles -------------------------------------------------------------------------------------------------
+
+
+@njit(cache=True, nogil=True)
+def match_local(
+    store: Store,
+    triangles: Int[np.ndarray, "t 3"],
+    xyz: Float[np.ndarray, "n 3"],
+    cov: Float[np.ndarray, "n 3 3"],
+    map_xyz: Float[np.ndarray, "k 3"],
+    map_cov: Float[np.ndarray, "k 3 3"],
+    map_view: Float[np.ndarray, "k 3"],
+    widest: float,
+    sigmas: float,
+    floor_mm: float,
+    limit: int,
+) -> tuple[Int[np.ndarray, "h 7"], int, float]:
+    """Pairs of a frame's triangles with congruent ones of the table: three points, three targets, row of the triangle.
+
+    Ends after the triangle at which ``limit`` pairs are reached. Returns also how many were looked up, and how many
+    pairs chance would have brought: as many as the tolerances' share of the side space that was visited, and of the
+    triangles met there.
+    """
+    found = np.empty((64, 7), np.int64)
+    count = tried = 0
+    by_chance = 0.0
+    typical = _typical_variance(store, map_cov)
+    length, var, side, map_length, map_var = np.empty(3), np.empty(3), np.empty(3), np.empty(3), np.empty(3)
+    q = np.empty(3, np.int64)
+    low, high = np.empty(3, np.int64), np.empty(3, np.int64)
+    buckets = len(store.side_head)
+    for f in range(len(triangles)):
+        if count >= limit:
+            break
+        tried += 1
+        p = triangles[f]
+        _measure(xyz, cov, p[0], p[1], p[2], length, var)
+        hand = _handedness(xyz, xyz, -1, p[0], p[1], p[2])
+        side[0], side[2] = min(length[0], length[1], length[2]), max(length[0], length[1], length[2])
+        side[1] = length[0] + length[1] + length[2] - side[0] - side[2]
+        # in ascending order sides pair best, whichever vertices they pair
+        reach = floor_mm + sigmas * np.sqrt(max(var[0], var[1], var[2]) + 2 * widest) + 2 * store.slack_mm
+        box = 1.0
+        visits = 1
+        for s in range(3):
+            low[s] = int(np.floor((side[s] - reach) / store.side_mm))
+            high[s] = int(np.floor((side[s] + reach) / store.side_mm))
+            visits *= high[s] - low[s] + 1
+            box *= 2 * (floor_mm + sigmas * np.sqrt(var[s] + typical)) / store.side_mm
+        is_sweep = visits > buckets  # so vague a triangle is compared with all
+        cells = visits if is_sweep else 0
+        met = 0
+        for n in range(buckets if is_sweep else visits):
+            bucket = n
+            i = j = k = 0
+            if not is_sweep:
+                across, deep = high[1] - low[1] + 1, high[2] - low[2] + 1
+                i, j, k = low[0] + n // (across * deep), low[1] + n // deep % across, low[2] + n % deep
+                if i > j or j > k or k > i + j + 1:  # no triangle has such sides
+                    continue
+                cells += 1
+                bucket = _bucket(i, j, k, buckets - 1)
+            e = store.side_head[bucket]
+            while e >= 0:
+                c = e // PAIRS
+                code = e - c * PAIRS
+                e = store.side_next[e]
+                a, b = store.neighbour[c, _FIRST[code]], store.neighbour[c, _SECOND[code]]
+                s0, s1 = np.sqrt(_distance2(store.anchor, c, a)), np.sqrt(_distance2(store.anchor, c, b))
+                s0, s1 = min(s0, s1), max(s0, s1)
+                s2 = np.sqrt(_distance2(store.anchor, a, b))
+                u, v, w = (
+                    int(np.floor(s0 / store.side_mm)),
+                    int(np.floor(s1 / store.side_mm)),
+                    int(np.floor(s2 / store.side_mm)),
+                )
+                if is_sweep:
+                    if not (low[0] <= u <= high[0] and low[1] <= v <= high[1] and low[2] <= w <= high[2]):
+                        continue
+                elif u != i or v != j or w != k:
+                    continue
+                met += 1
+                if abs(s0 - side[0]) > reach or abs(s1 - side[1]) > reach or abs(s2 - side[2]) > reach:
+                    continue
+                q[0], q[1], q[2] = a, b, c
+                _measure(map_xyz, map_cov, a, b, c, map_length, map_var)
+                map_hand = 2  # not known yet
+                for o in range(6):
+                    if not _agree(length, var, map_length, map_var, _ORDERS[o], sigmas, floor_mm):
+                        continue
+                    if map_hand == 2:
+                        map_hand = _handedness(map_xyz, map_view, 1, a, b, c)
+                    if hand * map_hand * (1 if o < 3 else -1) >= 0:  # an exchange turns the normal over
+                        found = _append(found, count, p, q, _ORDERS[o], f)
+                        count += 1
+        if cells > 0:
+            by_chance += met * min(box / cells, 1.0)
+    return found[:count], tried, by_chance
+
+
+# --- any three targets -----------------------------------------------------------------------------------------------
+
+
+class PairTable(NamedTuple):
+    """Pairs of targets by the distance of their anchors, in steps of ``step_mm``, and each target's partners."""
+
+    start: Int[np.ndarray, "b"]
+    """Where the pairs of each step begin."""
+    pair: Int32[np.ndarray, "m 2"]
+    """Rows of the pairs."""
+    first_partner: Int[np.ndarray, "cap+1"]
+    """Where the partners of each row begin."""
+    partner: Int32[np.ndarray, "2m"]
+    """Rows of the partners, nearest step first."""
+    step: Int32[np.ndarray, "2m"]
+    """The step of each."""
+    step_mm: float
+    """Width of a step."""
+
+
+@njit(cache=True, nogil=True)
+def count_pairs(
+    anchor: Float32[np.ndarray, "cap 3"], rows: Int[np.ndarray, "r"], axis: int, steps: int, step_mm: float, limit: int
+) -> tuple[Int[np.ndarray, "b"], int]:
+    """Where the pairs of each step begin, for rows sorted along an axis; and comparisons, given up at ``limit``."""
+    start = np.zeros(steps + 1, np.int64)
+    reach = steps * step_mm
+    compared = 0
+    for m in range(len(rows)):
+        for n in range(m + 1, len(rows)):
+            if anchor[rows[n], axis] - anchor[rows[m], axis] > reach:
+                break
+            compared += 1
+            step = int(np.sqrt(_distance2(anchor, rows[m], rows[n])) / step_mm)
+            if step < steps:
+                start[step + 1] += 1
+        if compared > limit:
+            break
+    for b in range(steps):
+        start[b + 1] += start[b]
+    return start, compared
+
+
+@njit(cache=True, nogil=True)
+def list_pairs(
+    anchor: Float32[np.ndarray, "cap 3"],
+    rows: Int[np.ndarray, "r"],
+    axis: int,
+    start: Int[np.ndarray, "b"],
+    step_mm: float,
+) -> PairTable:
+    """The table of the pairs that ``count_pairs`` counted."""
+    steps = len(start) - 1
+    reach = steps * step_mm
+    pair = np.empty((start[steps], 2), np.int32)
+    place = start[:-1].copy()
+    first = np.zeros(len(anchor) + 1, np.int64)
+    for m in range(len(rows)):
+        for n in range(m + 1, len(rows)):
+            if anchor[rows[n], axis] - anchor[rows[m], axis] > reach:
+                break
+            step = int(np.sqrt(_distance2(anchor, rows[m], rows[n])) / step_mm)
+            if step < steps:
+                pair[place[step], 0], pair[place[step], 1] = rows[m], rows[n]
+                place[step] += 1
+                first[rows[m] + 1] += 1
+                first[rows[n] + 1] += 1
+    for r in range(len(anchor)):
+        first[r + 1] += first[r]
+    partner, step_of = np.empty(2 * len(pair), np.int32), np.empty(2 * len(pair), np.int32)
+    free = first[:-1].copy()
+    for step in range(steps):
+        for m in range(start[step], start[step + 1]):
+            for end in range(2):
+                r = pair[m, end]
+                partner[free[r]], step_of[free[r]] = pair[m, 1 - end], step
+                free[r] += 1
+    return PairTable(start, pair, first, partner, step_of, step_mm)
+
+
+@njit(cache=True, nogil=True)
+def match_any(
+    store: Store,
+    table: PairTable,
+    triangles: Int[np.ndarray, "t 3"],
+    xyz: Float[np.ndarray, "n 3"],
+    cov: Float[np.ndarray, "n 3 3"],
+    map_xyz: Float[np.ndarray, "k 3"],
+    map_cov: Float[np.ndarray, "k 3 3"],
+    map_view: Float[np.ndarray, "k 3"],
+    widest: float,
+    sigmas: float,
+    floor_mm: float,
+    limit: int,
+    max_comparisons: int,
+) -> tuple[Int[np.ndarray, "h 7"], int, float, bool]:
+    """The pairs of ``match_local`` with any three targets; and whether ``max_comparisons`` ended the search.
+
+    The frame's longest side is laid on every pair of targets that is as long, both ways round; third targets are
+    among the partners of its one end.
+    """
+    found = np.empty((64, 7), np.int64)
+    count = tried = compared = 0
+    by_chance = 0.0
+    is_cut = False
+    typical = _typical_variance(store, map_cov)
+    length, var, map_length, map_var = np.empty(3), np.empty(3), np.empty(3), np.empty(3)
+    p, q = np.empty(3, np.int64), np.empty(3, np.int64)
+    steps = len(table.start) - 1
+    for f in range(len(triangles)):
+        if count >= limit or is_cut:
+            break
+        tried += 1
+        p[:] = triangles[f]
+        _measure(xyz, cov, p[0], p[1], p[2], length, var)
+        last = np.argmax(length)  # p[2] is to lie opposite the longest side
+        p[last], p[2] = p[2], p[last]
+        _measure(xyz, cov, p[0], p[1], p[2], length, var)
+        hand = _handedness(xyz, xyz, -1, p[0], p[1], p[2])
+        reach = floor_mm + sigmas * np.sqrt(max(var[0], var[1], var[2]) + 2 * widest) + 2 * store.slack_mm
+        wide = 4 * reach  # chance is judged from third sides that miss by up to so much
+        low, high = max(int((length[2] - reach) / table.step_mm), 0), int((length[2] + reach) / table.step_mm)
+        low1, high1 = max(int((length[1] - reach) / table.step_mm), 0), int((length[1] + reach) / table.step_mm)
+        high, high1 = min(high, steps - 1), min(high1, steps - 1)
+        met = 0
+        for m in range(table.start[low], table.start[high + 1]):
+            for end in range(2):
+                a, b = table.pair[m, end], table.pair[m, 1 - end]
+                begin, stop = table.first_partner[a], table.first_partner[a + 1]
+                n = begin + np.searchsorted(table.step[begin:stop], low1)
+                compared += 1
+                while n < stop and table.step[n] <= high1:
+                    c = table.partner[n]
+                    n += 1
+                    compared += 1
+                    miss = abs(np.sqrt(_distance2(store.anchor, b, c)) - length[0])
+                    if miss > wide or c == b:
+                        continue
+                    met += 1
+                    if miss > reach:
+                        continue
+                    q[0], q[1], q[2] = a, b, c
+                    _measure(map_xyz, map_cov, a, b, c, map_length, map_var)
+                    if (
+                        _agree(length, var, map_length, map_var, _ORDERS[0], sigmas, floor_mm)
+                        and hand * _handedness(map_xyz, map_view, 1, a, b, c) >= 0
+                    ):
+                        found = _append(found, count, p, q, _ORDERS[0], f)
+                        count += 1
+            if compared > max_comparisons:
+                is_cut = True
+                break
+        volume = (high - low + 1) * (high1 - low1 + 1) * table.step_mm**2 * (wide + min(wide, length[0]))
+        box = 1.0
+        for s in range(3):
+            box *= 2 * (floor_mm + sigmas * np.sqrt(var[s] + typical))
+        by_chance += met * min(box / volume, 1.0)
+    return found[:count], tried, by_chance, is_cut
+
+
+# --- triangles of a frame --------------------------------------------------------------------------------------------
+
+
+@njit(cache=True, nogil=True)
+def frame_triangles(
+    xyz: Float[np.ndarray, "n 3"], cov: Float[np.ndarray, "n 3 3"], neighbours: int
+) -> tuple[Int[np.ndarray, "t 3"], Float[np.ndarray, "t"]]:
+    """Triangles as the table holds them, of points and their nearest others; and their standard deviations to size."""
+    n = len(xyz)
+    k = max(min(neighbours, n - 1), 0)
+    triangles = np.empty((n * k * (k - 1) // 2, 3), np.int64)
+    vague = np.empty(len(triangles))
+    count = 0
+    near, distance2 = np.empty(k, np.int64), np.empty(k)
+    length, var = np.empty(3), np.empty(3)
+    for p in range(n):
+        held = 0
+        for q in range(n):
+            d = (xyz[p, 0] - xyz[q, 0]) ** 2 + (xyz[p, 1] - xyz[q, 1]) ** 2 + (xyz[p, 2] - xyz[q, 2]) ** 2
+            if q == p or (held == k and d >= distance2[k - 1]):
+                continue
+            rank = held if held < k else k - 1
+            while rank > 0 and distance2[rank - 1] > d:
+                distance2[rank], near[rank] = distance2[rank - 1], near[rank - 1]
+                rank -= 1
+            distance2[rank], near[rank] = d, q
+            held = min(held + 1, k)
+        for i in range(k):
+            for j in range(i + 1, k):
+                a, b = near[i], near[j]
+                ab2 = (xyz[a, 0] - xyz[b, 0]) ** 2 + (xyz[a, 1] - xyz[b, 1]) ** 2 + (xyz[a, 2] - xyz[b, 2]) ** 2
+                if not _is_owner(p, a, b, distance2[i], distance2[j], ab2):
+                    continue
+                _measure(xyz, cov, p, a, b, length, var)
+                triangles[count, 0], triangles[count, 1], triangles[count, 2] = p, a, b
+                vague[count] = np.sqrt(var[0] * var[1] * var[2]) / length[0] ** 3
+                count += 1
+    return triangles[:count], vague[:count]
+
+
+@njit(cache=True, nogil=True)
+def turns(triangles: Int[np.ndarray, "t 3"], points: int) -> Int[np.ndarray, "t"]:
+    """The round in which each triangle has its turn when no point takes part twice in a round."""
+    out = np.empty(len(triangles), np.int64)
+    rounds = np.zeros(points, np.int64)
+    for f in range(len(triangles)):
+        p, a, b = triangles[f, 0], triangles[f, 1], triangles[f, 2]
+        out[f] = max(rounds[p], rounds[a], rounds[b])
+        rounds[p] = rounds[a] = rounds[b] = out[f] + 1
+    return out
+
+
 def warm_up() -> None:
     """Compiles every loop of this module for the types that it meets in use."""
     xyz = np.array([[0.0, 0.0, 400.0], [40.0, 0.0, 410.0], [0.0, 60.0, 420.0], [50.0, 70.0, 400.0]])
@@ -404,3 +792,10 @@ def warm_up() -> None:
     changed_rows(store, *known, cov, 1)
     index_rows(store, *known, 1, 0, 0)
     link_all(with_empty_tables(store, len(xyz)))
+    view = np.tile([0.0, 0.0, -1.0], (len(xyz), 1))
+    frame, _ = frame_triangles(xyz, cov, 3)
+    turns(frame, len(xyz))
+    scene = (frame, xyz, cov, xyz, cov, view, 0.01, 3.0, 0.0, 9)
+    match_local(store, *scene)
+    start, _ = count_pairs(store.anchor, rows, 0, 100, 1.0, 9)
+    match_any(store, list_pairs(store.anchor, rows, 0, start, 1.0), *scene, 99)
