@@ -108,6 +108,13 @@ def test_an_impossible_map_is_refused_with_its_line(tmp_path: Path, text: str, m
         read_map(tmp_path / "map.csv")
 
 
+def test_a_map_in_metres_is_refused_with_a_hint_at_the_unit(tmp_path: Path) -> None:
+    rows = [f"{i},{0.1 * i},{0.03 * i * i},0.4" for i in range(8)]
+    (tmp_path / "map.csv").write_text("\n".join(["id,x_mm,y_mm,z_mm", *rows]) + "\n")
+    with pytest.raises(MapError, match=r"map\.csv: all 8 targets lie within 1\.63 mm, .*in metres\? Multiply"):
+        read_map(tmp_path / "map.csv")
+
+
 def test_a_missing_map_is_named(tmp_path: Path) -> None:
     with pytest.raises(MapError, match=r"map\.csv does not exist"):
         read_map(tmp_path / "map.csv")

@@ -280,15 +280,22 @@ def test_faulty_covariances_are_refused(tmp_path: Path, header: str, cells: str,
         read_recording(tmp_path)
 
 
-@pytest.mark.parametrize("cells", ["1,inf,3,1,0,0,1,0,1", "1,2,3,1,0,0,1,0,nan", "1,2,3,1,0,0,1,0,"])
+@pytest.mark.parametrize("cells", ["1,inf,300,1,0,0,1,0,1", "1,2,300,1,0,0,1,0,nan", "1,2,300,1,0,0,1,0,"])
 def test_points_that_are_not_finite_spoil_their_frame_alone(tmp_path: Path, cells: str) -> None:
     rows = (
-        f"frame,timestamp_ns,x_mm,y_mm,z_mm,xx,xy,xz,yy,yz,zz\n3,1080000000,1,2,3,1,0,0,1,0,1\n0,1000000000,{cells}\n"
+        f"frame,timestamp_ns,x_mm,y_mm,z_mm,xx,xy,xz,yy,yz,zz\n3,1080000000,1,2,300,1,0,0,1,0,1\n0,1000000000,{cells}\n"
     )
     write_tables(tmp_path, "points.csv", rows)
     recording = read_recording(tmp_path)
     assert kinds(recording) == ["Unusable", "SensorPoints", "SensorPoints"]
     assert "points.csv, line 3, column" in unusable(recording.frame(0)).detail
+
+
+def test_points_in_metres_are_refused_with_a_hint_at_the_unit(tmp_path: Path) -> None:
+    rows = "frame,timestamp_ns,x_mm,y_mm,z_mm\n0,1000000000,0.03,-0.12,0.45\n0,1000000000,0.05,0.1,30\n"
+    write_tables(tmp_path, "points.csv", rows + "3,1080000000,0.01,0.02,0.5\n")
+    with pytest.raises(RecordingError, match=r"points\.csv: half .* within 0\.5 mm of the sensor.*in metres\?"):
+        read_recording(tmp_path)
 
 
 # --- frames.csv

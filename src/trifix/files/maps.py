@@ -24,6 +24,7 @@ from trifix.records import ReferenceMap, TargetState
 
 _XYZ = ("x_mm", "y_mm", "z_mm")
 _LARGEST_ID = 2**53  # further on, programs that hold numbers as float64 mistake one for another
+_LEAST_ACROSS_MM = 5.0  # less, and no three targets stand far enough from one line to hold a pose
 _VIEW = ("nx", "ny", "nz")
 _STATES = tuple(state.name for state in TargetState if state is not TargetState.removed)
 
@@ -34,7 +35,8 @@ def read_map(path: Path | str) -> ReferenceMap:
     Without a covariance a target is where it is said to be, without a state it is trusted. Directions are normalised.
 
     Raises:
-        MapError: the file is missing, broken, names a target twice, or holds an impossible value.
+        MapError: the file is missing, broken, names a target twice, or holds an impossible value; or its targets
+            lie so near to one another that they must be given in metres.
     """
     path = Path(path)
     table = read_table(
@@ -50,8 +52,15 @@ def read_map(path: Path | str) -> ReferenceMap:
         twice = identity[first[int((count > 1).argmax())]]
         lines = line[identity == twice]
         raise MapError(f"{path}, line {lines[1]}: id {twice} already stands in line {lines[0]}, expected it once.")
+    xyz = np.stack([table[name] for name in _XYZ], axis=1)
+    across = float(np.linalg.norm(np.ptp(xyz, axis=0))) if len(xyz) >= 3 else np.inf
+    if across < _LEAST_ACROSS_MM:
+        raise MapError(
+            f"{path}: all {len(xyz)} targets lie within {across:.3g} mm, expected at least {_LEAST_ACROSS_MM:g}; are "
+            f"{', '.join(_XYZ)} in metres? Multiply them by 1000."
+        )
     return ReferenceMap.given(
-        xyz_mm=np.stack([table[name] for name in _XYZ], axis=1),
+        xyz_mm=xyz,
         cov_mm2=_covariances(path, table),
         view=_views(path, table),
         id=identity,

@@ -37,6 +37,7 @@ LEVELS: tuple[Level, ...] = ("images", "dots", "points")
 """The levels, richest first."""
 
 _LATERAL_PER_MM = 1e-3  # sigma of a point across its ray, without a rig: as seen with a focal length of 1000 px
+_NEAREST_MM = 5.0  # no sensor sees targets nearer than this
 _LENGTHENING = 5.0  # and along the ray, in units of that
 
 
@@ -201,9 +202,11 @@ def _open_points(path: Path, sigma_px: float) -> Recording:
         for row in np.flatnonzero(table["z_mm"] <= 0):
             found = f"{file.name}, line {table[LINE][row]}, column 'z_mm': found {table['z_mm'][row]}"
             faults.setdefault(int(position[row]), f"{found}, expected a point before the sensor.")
+    xyz_mm = np.stack([table[name] for name in xyz], axis=1)
+    _refuse_metres(file, xyz_mm)
     order = np.argsort(position, kind="stable")
     points = SensorPoints(
-        xyz_mm=np.stack([table[name] for name in xyz], axis=1)[order],
+        xyz_mm=xyz_mm[order],
         cov_mm2=cov[order],
         match=np.full(n, -1),
         label=table.get("label", np.full(n, -1))[order],
@@ -214,6 +217,16 @@ def _open_points(path: Path, sigma_px: float) -> Recording:
     rig, rigs = _read_rigs(path, timestamp_ns, is_needed=False)
     source = _PointTable(points, start, faults, sigma_px)
     return Recording(path, "points", index, timestamp_ns, is_noise_stated, rig, rigs, source.content)
+
+
+def _refuse_metres(file: Path, xyz_mm: Float[np.ndarray, "n 3"]) -> None:
+    """Refuses points of which half lie where no target can be seen: they are not in millimetres."""
+    distance = np.linalg.norm(xyz_mm[np.isfinite(xyz_mm).all(axis=1)], axis=1)
+    if len(distance) and np.median(distance) < _NEAREST_MM:
+        raise RecordingError(
+            f"{file}: half of the points lie within {np.median(distance):.3g} mm of the sensor, expected at least "
+            f"{_NEAREST_MM:g}; are x_mm, y_mm, z_mm in metres? Multiply them by 1000, and a covariance by 1000000."
+        )
 
 
 @dataclass(frozen=True, slots=True, eq=False)
