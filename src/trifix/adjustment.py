@@ -16,7 +16,7 @@ from jaxtyping import Bool, Float, Int
 from trifix.errors import AdjustmentError
 from trifix.geometry.alignment import point_jacobian
 from trifix.geometry.camera import Camera, StereoRig
-from trifix.geometry.pose import Pose
+from trifix.geometry.pose import Pose, skew
 from trifix.kernels import adjustment as kernels
 
 MOST_TARGETS = 3000
@@ -393,14 +393,14 @@ class _RigUnknowns:
     def __init__(self, rig: StereoRig, sigmas: RigSigmas, knows_scale: bool):
         self.given, self.knows_scale = rig, knows_scale
         places = ("x_mm", "y_mm", "z_mm") if knows_scale else ("across_1_mm", "across_2_mm")
-        names, sigma = [*places, "x_rad", "y_rad", "z_rad"], [sigmas.translation_mm] * len(places)
-        sigma += [sigmas.rotation_rad] * 3
+        names = [*places, "x_rad", "y_rad", "z_rad"]
+        sigma = [sigmas.translation_mm] * 3 + [sigmas.rotation_rad] * 3
         for side, camera in (("left", rig.left), ("right", rig.right)):
             all_names = ["k1", "k2", "p1", "p2", "k3"] if camera.model == "radtan" else ["k1", "k2", "k3", "k4"]
             coefficients = all_names[: len(camera.coefficients)]
             names += [f"{side}_{name}" for name in ("fu_px", "fv_px", "pu_px", "pv_px", *coefficients)]
             sigma += [sigmas.focal_px] * 2 + [sigmas.principal_px] * 2 + [sigmas.distortion] * len(coefficients)
-        self.names, self.information = tuple(names), 1 / np.array(sigma) ** 2
+        self.names, self.sigma = tuple(names), np.array(sigma)
 
     def __len__(self) -> int:
         return len(self.names)
@@ -425,16 +425,22 @@ class _RigUnknowns:
         split = basis.shape[1] + 4 + len(rig.left.coefficients)
         return StereoRig(_stepped(rig.left, step[basis.shape[1] : split]), _stepped(rig.right, step[split:]), T)
 
-    def deviation(self, rig: StereoRig) -> Float[np.ndarray, "q"]:
-        """How far the rig has moved from the given one, to first order a step that leads there."""
+    def calibration(self, rig: StereoRig) -> tuple[Float[np.ndarray, "e"], Float[np.ndarray, "e q"]]:
+        """How far the rig is from the given one, in standard deviations, and the derivative by a step.
+
+        log(exp(δ) · exp(ε)) = δ + (1 + ad/2 + ad²/12 + O(δ⁴)) ε, with ad the adjoint of δ.
+        """
         delta = (self.given.T_right_left.inverse() @ rig.T_right_left).log()
-        return np.concatenate(
-            [
-                self._basis(rig).T @ delta,
-                _intrinsics(rig.left) - _intrinsics(self.given.left),
-                _intrinsics(rig.right) - _intrinsics(self.given.right),
-            ]
-        )
+        ad = np.zeros((6, 6))
+        ad[:3, :3] = ad[3:, 3:] = skew(delta[3:])
+        ad[:3, 3:] = skew(delta[:3])
+        basis = self._basis(rig)
+        J = np.zeros((len(self.sigma), len(self)))
+        J[:6, : basis.shape[1]] = (np.eye(6) + ad / 2 + ad @ ad / 12) @ basis
+        J[6:, basis.shape[1] :] = np.eye(len(self.sigma) - 6)
+        left = _intrinsics(rig.left) - _intrinsics(self.given.left)
+        right = _intrinsics(rig.right) - _intrinsics(self.given.right)
+        return np.concatenate([delta, left, right]) / self.sigma, J / self.sigma[:, None]
 
     def jacobian(
         self,
@@ -631,7 +637,7 @@ class _Search:
             length = float(np.linalg.norm(state.xyz_mm[bar.first] - state.xyz_mm[bar.second]))
             chi2 += ((length - bar.length_mm) / bar.sigma_mm) ** 2
         if network.rig_unknowns is not None:
-            chi2 += float(network.rig_unknowns.information @ network.rig_unknowns.deviation(state.rigs[0]) ** 2)
+            chi2 += float((network.rig_unknowns.calibration(state.rigs[0])[0] ** 2).sum())
         return chi2
 
     def _bars(self) -> list[ScaleBar]:
@@ -656,9 +662,10 @@ class _Search:
                 for d, J_d in ends:
                     S[c : c + 3, d : d + 3] += np.outer(J_c, J_d)
         if network.rig_unknowns is not None:
-            q, information = len(network.rig_unknowns), network.rig_unknowns.information
-            S[-q:, -q:] += linear.H_rig + np.diag(information)
-            g[-q:] += linear.g_rig - information * network.rig_unknowns.deviation(state.rigs[0])
+            q = len(network.rig_unknowns)
+            off, J = network.rig_unknowns.calibration(state.rigs[0])
+            S[-q:, -q:] += linear.H_rig + J.T @ J
+            g[-q:] += linear.g_rig - J.T @ off
         return S, g
 
     # one step
@@ -759,8 +766,8 @@ class _Search:
         if not len(target) or column >= self.column[target[-1]] + 3:
             return "The rig cannot be refined: what was seen does not determine it."
         return (
-            f"Target {target[-1]} is not tied to {gauge}, which define the world: no chain of frames that have three "
-            "targets in common leads to it; leave it and the frames around it out."
+            f"Target {target[-1]} is not tied to {gauge}: no chain of frames leads there in which each has three "
+            "targets in common with those before it; leave it and the frames around it out."
         )
 
     def _moved(self, solution: _Solution) -> _State:
