@@ -109,6 +109,18 @@ def test_stated_noise_sizes_and_labels_are_read(tmp_path: Path) -> None:
     np.testing.assert_allclose(left.ellipse[2], [6, 3, 0.5 + np.pi / 2])
 
 
+def test_a_dot_without_stated_noise_has_that_to_start_from(tmp_path: Path) -> None:
+    rows = "frame,timestamp_ns,camera,u,v,sigma_px\n0,1000000000,0,1,2,0.1\n0,1000000000,0,3,4,{}\n"
+    write_tables(tmp_path, "dots.csv", rows.format(""))
+    recording = read_recording(tmp_path, sigma_px=0.4)
+    assert recording.is_noise_stated
+    np.testing.assert_allclose(stereo_dots(recording.frame(0)).left.cov_px2[:, 0, 0], [0.01, 0.16], atol=1e-15)
+    write_tables(tmp_path, "dots.csv", rows.format("").replace("0.1", ""))
+    assert not read_recording(tmp_path).is_noise_stated
+    write_tables(tmp_path, "dots.csv", rows.format("inf"))
+    assert "column 'sigma_px': found inf" in unusable(read_recording(tmp_path).frame(0)).detail
+
+
 @pytest.mark.parametrize(
     ("old", "new", "message"),
     [

@@ -156,9 +156,10 @@ def _open_dots(path: Path, sigma_px: float) -> Recording:
     for name in ("sigma_px", "diameter_px", "a_px", "b_px"):
         if name in table:
             refuse_where(table[name] <= 0, file, table, name, "a positive number")
-    is_noise_stated = "sigma_px" in table
     n = len(position)
-    sigma = table["sigma_px"] if is_noise_stated else np.full(n, sigma_px)
+    stated = table.get("sigma_px", np.full(n, np.nan))
+    is_noise_stated = not np.isnan(stated).all()
+    sigma = np.where(np.isnan(stated), sigma_px, stated)  # an empty cell states nothing
     image = 2 * position + camera
     order = np.argsort(image, kind="stable")
     dots = Dots(
@@ -171,7 +172,7 @@ def _open_dots(path: Path, sigma_px: float) -> Recording:
     source = _DotTable(
         dots,
         start=np.searchsorted(image[order], np.arange(2 * len(index) + 1)),
-        faults=_faults(file, table, ("u", "v", "sigma_px"), position),
+        faults=_faults(file, {**table, "sigma_px": sigma}, ("u", "v", "sigma_px"), position),
     )
     rig, rigs = _read_rigs(path, timestamp_ns, is_needed=True)
     return Recording(path, "dots", index, timestamp_ns, is_noise_stated, rig, rigs, source.content)
