@@ -236,11 +236,12 @@ def frame_triangles(
 ) -> Int[np.ndarray, "t 3"]:
     """A frame's triangles of the kind that the index holds, among so many nearest neighbours, most promising first.
 
-    Promising are those whose sides are well known for their size: they agree with few others by chance. All points
-    take turns, so that one which is no target spoils no more than its share of any stretch.
+    Promising are those of the nearest neighbours, as these are neighbours in the map, too, whatever else the frame
+    sees or misses; among them, those whose sides are well known for their length. All points take turns, so that one
+    which is no target spoils no more than its share of any stretch.
     """
-    triangles, vague = kernels.frame_triangles(xyz_mm, cov_mm2, neighbours)
-    triangles = triangles[np.argsort(vague, kind="stable")]
+    triangles, place = kernels.frame_triangles(xyz_mm, cov_mm2, neighbours)
+    triangles = triangles[np.argsort(place, kind="stable")]
     return np.asarray(triangles[np.argsort(kernels.turns(triangles, len(xyz_mm)), kind="stable")])
 
 
@@ -249,5 +250,5 @@ def _spacing_mm(xyz_mm: Float[np.ndarray, "k 3"], rows: Int[np.ndarray, "a"]) ->
     if len(rows) < 4:
         apart = np.ptp(xyz_mm[rows], axis=0) if len(rows) else np.zeros(3)
         return float(np.linalg.norm(apart)) or 1.0
-    sample = rows[:: -(-len(rows) // _SAMPLE)]
-    return max(float(np.median(kernels.distances_to_third(xyz_mm, rows, sample))), 1e-3)
+    every = -(-len(rows) // _SAMPLE)
+    return max(float(np.median(kernels.distances_to_third(xyz_mm, rows, every))), 1e-3)

@@ -374,10 +374,9 @@ def link_all(store: Store) -> None:
 
 
 @njit(cache=True, nogil=True)
-def distances_to_third(
-    xyz: Float[np.ndarray, "k 3"], rows: Int[np.ndarray, "a"], sample: Int[np.ndarray, "s"]
-) -> Float[np.ndarray, "s"]:
-    """Distance from each row of ``sample`` to the third nearest other of ``rows``; infinite where there are fewer."""
+def distances_to_third(xyz: Float[np.ndarray, "k 3"], rows: Int[np.ndarray, "a"], every: int) -> Float[np.ndarray, "s"]:
+    """Distance from one of ``every`` so many rows to the third nearest of the others; infinite where there are fewer."""
+    sample = rows[::every]
     out = np.empty(len(sample))
     for n in range(len(sample)):
         p = sample[n]
@@ -736,11 +735,15 @@ def match_any(
 def frame_triangles(
     xyz: Float[np.ndarray, "n 3"], cov: Float[np.ndarray, "n 3 3"], neighbours: int
 ) -> tuple[Int[np.ndarray, "t 3"], Float[np.ndarray, "t"]]:
-    """Triangles as the table holds them, of points and their nearest others; and their standard deviations to size."""
+    """Triangles as the table holds them, of points and their nearest others; and their place in a fair order of trial.
+
+    That is the rank of the farther neighbour, as few points can have come between, or be missing in the map, where
+    neighbours are near; and after the decimal point the standard deviations of the sides against their length.
+    """
     n = len(xyz)
     k = max(min(neighbours, n - 1), 0)
     triangles = np.empty((n * k * (k - 1) // 2, 3), np.int64)
-    vague = np.empty(len(triangles))
+    place = np.empty(len(triangles))
     count = 0
     near, distance2 = np.empty(k, np.int64), np.empty(k)
     length, var = np.empty(3), np.empty(3)
@@ -764,9 +767,10 @@ def frame_triangles(
                     continue
                 _measure(xyz, cov, p, a, b, length, var)
                 triangles[count, 0], triangles[count, 1], triangles[count, 2] = p, a, b
-                vague[count] = np.sqrt(var[0] * var[1] * var[2]) / length[0] ** 3
+                vague = np.sqrt(var[0] * var[1] * var[2]) / length[0] ** 3
+                place[count] = j + vague / (1 + vague)
                 count += 1
-    return triangles[:count], vague[:count]
+    return triangles[:count], place[:count]
 
 
 @njit(cache=True, nogil=True)
@@ -787,7 +791,7 @@ def warm_up() -> None:
     cov = np.tile(np.eye(3) * 0.01, (len(xyz), 1, 1))
     rows = np.arange(len(xyz))
     store = new_store(len(xyz), len(xyz), 50.0, 0.1)
-    distances_to_third(xyz, rows, rows[::2])
+    distances_to_third(xyz, rows, 2)
     known = rows, rows, np.ones(len(xyz), dtype=np.int64), xyz
     changed_rows(store, *known, cov, 1)
     index_rows(store, *known, 1, 0, 0)
