@@ -19,7 +19,7 @@ from trifix.geometry.camera import Camera, StereoRig
 from trifix.geometry.pose import Pose, exp_rotation
 from trifix.kernels import adjustment as kernels
 
-SIZES = ((100, 28, 28), (1000, 28, 28), (5571, 28, 28), (1000, 900, 25), (4000, 900, 25))
+SIZES = ((500, 28, 28), (1500, 28, 28), (5571, 28, 28), (1000, 900, 25), (2000, 900, 25), (4000, 900, 25))
 """Frames, targets, targets seen in a frame."""
 
 SIGMA_PX = 0.1
@@ -84,7 +84,7 @@ def scene(
     xy = grid + rng.uniform(-0.3, 0.3, grid.shape) * SPACING_MM
     xyz = np.c_[xy, 20.0 * np.sin(xy / 60.0).sum(axis=1)]
     turns = np.linspace(0, 2 * np.pi * np.sqrt(targets) / 4, frames)
-    middle, reach = side * SPACING_MM / 2, 0.45 * side * SPACING_MM
+    middle, reach = side * SPACING_MM / 2, 0.6 * side * SPACING_MM
     poses, parts = [], []
     for k, turn in enumerate(turns):  # a spiral over the sheet
         out = reach * np.sqrt(abs(2 * k / frames - 1))

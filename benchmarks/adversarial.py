@@ -231,7 +231,7 @@ def mirrored(rng: np.random.Generator, f: int) -> tuple[World, Batch]:
 def grid(rng: np.random.Generator, f: int) -> tuple[World, Batch]:
     """Windows of a grid that reaches beyond the map."""
     jitter_mm = float(np.exp(rng.uniform(np.log(0.05), np.log(3.0))))
-    world = made_grid(rng, targets(rng), rng.uniform(15.0, 35.0), jitter_mm, sigma(rng))
+    world = made_grid(rng, targets(rng), rng.uniform(20.0, 40.0), jitter_mm, sigma(rng))
     count = counts(rng, f)
     centre = rng.integers(len(world.xyz_mm), size=f)
     xyz, label = patch(rng, world, count, with_strays(rng, count), centre)
@@ -309,7 +309,7 @@ def surface(rng: np.random.Generator, least: int = 30, relief: float | None = No
     """A curved object with a map of it; one in six is flat, unless told."""
     if relief is None:
         relief = 0.0 if rng.random() < 1 / 6 else rng.uniform(0.01, 0.06)
-    return made_world(rng, targets(rng, least), rng.uniform(15.0, 35.0), sigma(rng), relief)
+    return made_world(rng, targets(rng, least), rng.uniform(20.0, 40.0), sigma(rng), relief)
 
 
 def targets(rng: np.random.Generator, least: int = 30) -> int:

@@ -117,6 +117,13 @@ def summarised(results: Mapping[str, dict]) -> dict[str, object]:
     return {"frames": frames, "is_kept": bool(is_kept), "decades": rows}
 
 
+def wrong_of_promised(summary: dict) -> float:
+    """Wrong fixes by those that p_chance promised at most; it should not exceed one."""
+    wrong = sum(row["wrong"] for row in summary["decades"])
+    promised = sum(row["fixes"] * row["promised"] for row in summary["decades"] if row["fixes"])
+    return wrong / promised if promised else 0.0
+
+
 def table(summary: dict) -> Table:
     """The promise and what came of it."""
     names = ("p_chance up to", "fixes", "wrong", "share", "95 %", "allowed", "promised", "cautious", "verdict")
