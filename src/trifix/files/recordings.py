@@ -164,7 +164,7 @@ def _open_dots(path: Path, sigma_px: float) -> Recording:
     order = np.argsort(image, kind="stable")
     dots = Dots(
         uv_px=np.stack([table["u"], table["v"]], axis=1)[order],
-        cov_px2=(sigma[:, None, None] ** 2 * np.eye(2))[order],
+        cov_px2=np.where(np.eye(2) > 0, sigma[order, None, None] ** 2, 0.0),
         ellipse=_ellipses(table)[order],
         label=table.get("label", np.full(n, -1))[order],
         row=order,
