@@ -351,3 +351,20 @@ def test_a_near_regular_grid_is_positioned_throughout(tmp_path: Path) -> None:
     recording = read_recording(tmp_path / "grid" / "recording")
     steps = list(Positioner().run(recording.frame(k) for k in range(275)))
     assert all(isinstance(step.fix, Fix) for step in steps)
+
+
+@pytest.mark.parametrize(("stated_px", "at_least"), [(0.01, 34), (0.1, 34), (1.0, 30), (None, 34)])
+def test_a_wrongly_stated_noise_is_found_out(stated_px, at_least):
+    """The statue's dots have 0.1 px, a little more where they are seen slantwise; 36 of its first 60 frames are found."""
+    frames = []
+    for frame in simulate_frames("statue", 1, "dots", 60).frames:
+        assert isinstance(frame.content, StereoDots)
+        cov = (stated_px or 0.3) ** 2 * np.eye(2)
+        sides = (frame.content.left, frame.content.right)
+        dots = StereoDots(*(replace(side, cov_px2=np.tile(cov, (len(side), 1, 1))) for side in sides))
+        frames.append(replace(frame, content=dots))
+    positioner = Positioner(is_noise_stated=stated_px is not None)
+    steps = list(positioner.run(frames))
+    assert at_least <= sum(isinstance(step.fix, Fix) for step in steps) <= 40
+    found_px = (stated_px or 0.3) * positioner.noise.scale
+    assert 0.09 < found_px < 0.14

@@ -40,8 +40,15 @@ from trifix.stages.detect import detect
 from trifix.stages.identify import Identifier
 from trifix.stages.match import match
 from trifix.stages.triangulate import triangulate
-from trifix.stages.update import distinct
-from trifix.stages.weigh import NoiseScale, add_prior_noise, scale_points, weigh_matches, weigh_residuals
+from trifix.stages.update import distinct, stored
+from trifix.stages.weigh import (
+    NoiseScale,
+    add_prior_noise,
+    scale_points,
+    starting_scale,
+    weigh_matches,
+    weigh_residuals,
+)
 
 _COULD_BE_ELSEWHERE = (Reason.no_candidate, Reason.not_proven)
 
@@ -62,9 +69,11 @@ class Positioner:
         self.config = config or Config()
         self.noise = self._epipolar = self._residuals = NoiseScale()
         self._is_noise_stated = is_noise_stated
+        self._sought = 1.0
+        """Scale of the noise at which the newest frame's pairs were sought."""
         if is_map_frozen and (map is None or not map.alive.any()):
             raise MapError("A frozen map without targets was given: nothing could ever be found on it.")
-        self._world = Island(0, self.config, map or ReferenceMap.empty(), is_map_frozen)
+        self._world = Island(0, self.config, stored(map or ReferenceMap.empty()), is_map_frozen)
         self._next_id = int(self.map.id.max(initial=-1)) + 1
         self._last_ns = -(1 << 63)
         self._islands: list[Island] = []
@@ -157,7 +166,9 @@ class Positioner:
             case StereoDots():
                 assert frame.rig is not None, "dots come with the rig that saw them"
                 with clock("match"):
-                    matches = match(content, frame.rig, options.match, self.noise.scale)
+                    is_first_guess = self._is_noise_stated and not self.noise.is_known
+                    self._sought = starting_scale(content, options.noise) if is_first_guess else self.noise.scale
+                    matches = match(content, frame.rig, options.match, self._sought)
                     if not self.noise.is_known:
                         self._weigh_pairs(matches)
                 with clock("triangulate"):
@@ -271,9 +282,7 @@ class Positioner:
         hides some of them: where the residuals on targets are larger, these count.
         """
         gate, options = self.config.match.max_epipolar_sigmas, self.config.noise
-        now = weigh_matches(
-            replace(self._epipolar, scale=self.noise.scale), matches, gate, self._is_noise_stated, options
-        )
+        now = weigh_matches(replace(self._epipolar, scale=self._sought), matches, gate, self._is_noise_stated, options)
         self._epipolar = _newest(self._epipolar, now)
         is_larger = self._residuals.is_known and self._residuals.scale > self._epipolar.scale
         self._take_noise(self._residuals if is_larger else self._epipolar)
@@ -403,8 +412,9 @@ def _reversed(frame: Frame, last_ns: int) -> Frame:
 
 
 def _newest(before: NoiseScale, now: NoiseScale) -> NoiseScale:
-    """What is known now, with the scale that was last fitted."""
-    return now if now.fitted_at != before.fitted_at else replace(now, scale=before.scale)
+    """What is known now, with the scale last fitted, or the one to start from where a stated noise became doubtful."""
+    is_other = now.fitted_at != before.fitted_at or now.is_doubted != before.is_doubted
+    return now if is_other else replace(now, scale=before.scale)
 
 
 def _sum(first: dict[str, float], second: dict[str, float]) -> dict[str, float]:

@@ -43,7 +43,7 @@ class UpdateOptions:
 def found_map(points: SensorPoints, frame_index: int, next_id: int = 0) -> tuple[ReferenceMap, Int[np.ndarray, "a"]]:
     """The map of the first frame, whose sensor coordinates become the world's, and the rows of its targets."""
     rows = distinct(points, np.arange(len(points)))
-    map = _with_room(ReferenceMap.empty(), len(rows))
+    map = stored(ReferenceMap.empty(), len(rows))
     return _entered(map, 0, points, rows, Pose.identity(), np.zeros((6, 6)), frame_index, next_id)
 
 
@@ -59,7 +59,7 @@ def update(
 ) -> tuple[ReferenceMap, Int[np.ndarray, "a"]]:
     """The map after a fix, and the rows of the targets that entered it; the given map is left as it was."""
     k, T = len(map), fix.T_world_sensor
-    map = _with_room(map, len(points))
+    map = stored(map, len(points))
     xyz, cov = floats(points.xyz_mm), floats(points.cov_mm2)
     pose = floats(T.R), floats(T.t_mm), floats(fix.cov)
     point, target = integers(fix.point), integers(fix.target)
@@ -114,8 +114,8 @@ def distinct(points: SensorPoints, rows: Int[np.ndarray, "r"]) -> Int[np.ndarray
     return np.asarray(distinct_points(floats(points.xyz_mm), integers(rows)))
 
 
-def _with_room(map: ReferenceMap, extra: int) -> ReferenceMap:
-    """The same targets in storage of their own, with rows to spare."""
+def stored(map: ReferenceMap, extra: int = 0) -> ReferenceMap:
+    """The same targets in storage of their own, as compiled loops take it, with rows to spare."""
 
     def copied(array: np.ndarray, dtype: type) -> np.ndarray:
         out = np.empty((len(array) + extra, *array.shape[1:]), dtype=dtype)

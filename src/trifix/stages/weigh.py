@@ -5,16 +5,20 @@ map; given points tell by their residuals on identified targets. Only what is pa
 recording agree. Knows no pose.
 """
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Float
 
 from trifix.errors import ConfigError
-from trifix.records import Dots, Fix, ReferenceMap, SensorPoints, StereoMatches
+from trifix.kernels import floats, integers
+from trifix.kernels.mapping import squared_distances
+from trifix.kernels.stereo import likeliest_scale
+from trifix.records import Dots, Fix, ReferenceMap, SensorPoints, StereoDots, StereoMatches
 
 _CHI2_3_MEDIAN = 2.366  # median of chi-square with three degrees of freedom
-_SCALES = np.geomspace(0.02, 10.0, 128)  # candidates, 5 % apart
+_SCALES = np.geomspace(0.02, 100.0, 176)  # candidates, 5 % apart
+_DECISIVE = float(np.log(1e4))  # of a likelihood ratio
 
 
 @dataclass(frozen=True, slots=True)
@@ -45,14 +49,17 @@ class NoiseScale:
 
     scale: float = 1.0
     """Factor on all standard deviations."""
-    sigmas: Float[np.ndarray, "s"] = field(default_factory=lambda: np.zeros(0))
-    """Remembered residuals in standard deviations as stated: epipolar ones, or roots of chi-square over its median."""
-    gate: Float[np.ndarray, "s"] = field(default_factory=lambda: np.zeros(0))
-    """The largest value that each could have had."""
+    sigmas: tuple[Float[np.ndarray, "_"], ...] = ()
+    """Remembered residuals, those of a frame together, in standard deviations as stated: epipolar ones, or roots of
+    chi-square over its median."""
+    gates: tuple[float, ...] = ()
+    """The largest value that those of each frame could have had."""
     fitted_at: int = 0
     """Residuals seen when the scale was last fitted."""
     seen: int = 0
     """Residuals seen altogether."""
+    is_doubted: bool = False
+    """Whether the first pairs already contradict a stated noise: they lie too far from their epipolar lines."""
 
     @property
     def is_known(self) -> bool:
@@ -69,21 +76,36 @@ def add_prior_noise(dots: Dots, options: NoiseOptions) -> Dots:
     return replace(dots, cov_px2=dots.cov_px2 + options.sigma_px**2 * np.eye(2))
 
 
+def starting_scale(dots: StereoDots, options: NoiseOptions) -> float:
+    """Factor that makes the dots as noisy as where nothing is stated, and at least 1.
+
+    A stated noise that is far too small would hide the evidence against it: no true pair is near enough to its line.
+    Pairs are sought as widely as this until the noise is known.
+    """
+    variance = np.concatenate([dots.left.cov_px2[:, 0, 0], dots.right.cov_px2[:, 0, 0]])
+    return max(1.0, options.sigma_px / float(np.sqrt(np.median(variance)))) if len(variance) else 1.0
+
+
 def weigh_matches(
     noise: NoiseScale, matches: StereoMatches, max_sigmas: float, is_stated: bool, options: NoiseOptions
 ) -> NoiseScale:
     """The noise after the epipolar residuals of some pairs of dots, false ones among them.
 
-    True pairs are normal and false ones uniform across the gate; the likelihood of that mixture is maximised over the
-    scale and the share of true pairs.
+    True pairs are normal and false ones uniform across the gate, which is ``max_sigmas`` at the scale given; the
+    likelihood of that mixture is maximised over the scale and the share of true pairs. A stated noise that is too small
+    is doubted as soon as that is beyond question, and the scale given stays for lack of a better one.
     """
     if len(matches) == 0:
         return noise
     z = np.abs(matches.epipolar_px) / matches.epipolar_sigma_px
-    noise = _remember(noise, z, np.full(len(z), max_sigmas * noise.scale), options)
-    if not _is_due(noise, options):
-        return noise
-    return _with_scale(noise, _fit_mixture(noise.sigmas, noise.gate), is_stated, options)
+    noise = _remember(noise, z, max_sigmas * noise.scale)
+    if _is_due(noise, options):
+        noise = _recent(noise, options)
+        return _with_scale(noise, _likeliest_scale(noise)[0], is_stated, options)
+    if is_stated and not noise.is_known and not noise.is_doubted:
+        scale, gain = _likeliest_scale(noise)
+        return replace(noise, is_doubted=scale > options.stated_high and gain > _DECISIVE)
+    return noise
 
 
 def weigh_residuals(
@@ -102,31 +124,37 @@ def weigh_residuals(
     c = len(fix.point)
     if c < 4 or not np.isfinite(fix.p_chance):
         return noise
-    T = fix.T_world_sensor
-    r = map.xyz_mm[fix.target] - T.apply(points.xyz_mm[fix.point])
-    S = T.R @ points.cov_mm2[fix.point] @ T.R.T + map.cov_mm2[fix.target]
-    chi2 = np.einsum("ni,ni->n", r, np.linalg.solve(S, r[:, :, None])[:, :, 0])
-    z = noise.scale * np.sqrt(chi2 * c / (c - 2) / _CHI2_3_MEDIAN)
-    noise = _remember(noise, z, np.full(c, np.inf), options)
+    chi2 = squared_distances(
+        floats(map.xyz_mm),
+        floats(map.cov_mm2),
+        floats(points.xyz_mm),
+        floats(points.cov_mm2),
+        integers(fix.point),
+        integers(fix.target),
+        floats(fix.T_world_sensor.R),
+        floats(fix.T_world_sensor.t_mm),
+    )
+    noise = _remember(noise, noise.scale * np.sqrt(chi2 * (c / (c - 2) / _CHI2_3_MEDIAN)), np.inf)
     if not _is_due(noise, options):
         return noise
-    return _with_scale(noise, float(np.median(noise.sigmas)), is_stated, options)
+    noise = _recent(noise, options)
+    return _with_scale(noise, float(np.median(np.concatenate(noise.sigmas))), is_stated, options)
 
 
 def scale_points(points: SensorPoints, noise: NoiseScale) -> SensorPoints:
-    """Given points with the noise that was found in place of the one that was stated."""
-    return points if noise.scale == 1.0 else replace(points, cov_mm2=points.cov_mm2 * noise.scale**2)
-
-
-def _remember(noise: NoiseScale, z: np.ndarray, gate: np.ndarray, options: NoiseOptions) -> NoiseScale:
-    keep = options.max_samples
-    return NoiseScale(
-        noise.scale,
-        np.concatenate([noise.sigmas, z])[-keep:],
-        np.concatenate([noise.gate, gate])[-keep:],
-        noise.fitted_at,
-        noise.seen + len(z),
+    """Given points with the noise that was found in place of the one that was stated, as compiled loops take them."""
+    return replace(
+        points,
+        xyz_mm=floats(points.xyz_mm),
+        cov_mm2=floats(points.cov_mm2) if noise.scale == 1.0 else floats(points.cov_mm2) * noise.scale**2,
+        match=integers(points.match),
+        label=integers(points.label),
+        row=integers(points.row),
     )
+
+
+def _remember(noise: NoiseScale, z: Float[np.ndarray, "n"], gate: float) -> NoiseScale:
+    return replace(noise, sigmas=(*noise.sigmas, z), gates=(*noise.gates, gate), seen=noise.seen + len(z))
 
 
 def _is_due(noise: NoiseScale, options: NoiseOptions) -> bool:
@@ -135,25 +163,25 @@ def _is_due(noise: NoiseScale, options: NoiseOptions) -> bool:
     return noise.seen >= options.min_samples and grown
 
 
+def _recent(noise: NoiseScale, options: NoiseOptions) -> NoiseScale:
+    """The same without the residuals that are too many, the oldest ones."""
+    sigmas, room = [], options.max_samples
+    for z in reversed(noise.sigmas):
+        if room <= 0:
+            break
+        sigmas.append(z[-room:])
+        room -= len(z)
+    return replace(noise, sigmas=tuple(reversed(sigmas)), gates=noise.gates[-len(sigmas) :])
+
+
 def _with_scale(noise: NoiseScale, scale: float, is_stated: bool, options: NoiseOptions) -> NoiseScale:
     if is_stated and options.stated_low <= scale <= options.stated_high:
         scale = 1.0
-    scale = float(np.clip(scale, _SCALES[0], _SCALES[-1]))
-    return NoiseScale(scale, noise.sigmas, noise.gate, noise.seen, noise.seen)
+    return replace(noise, scale=float(np.clip(scale, _SCALES[0], _SCALES[-1])), fitted_at=noise.seen)
 
 
-def _fit_mixture(z: np.ndarray, gate: np.ndarray) -> float:
-    """Scale of the normal part of |z| < gate: normal (cut at the gate) with some share, uniform with the rest."""
-    from scipy.special import erf
-
-    best, best_value = 1.0, -np.inf
-    uniform = 1.0 / gate
-    for scale in _SCALES:
-        normal = np.sqrt(2 / np.pi) / scale * np.exp(-0.5 * (z / scale) ** 2) / erf(gate / scale / np.sqrt(2))
-        share = 0.5
-        for _ in range(8):  # expectation-maximisation of the share alone
-            share = float(np.mean(share * normal / (share * normal + (1 - share) * uniform)))
-        value = float(np.log(share * normal + (1 - share) * uniform).sum()) - np.log(scale) ** 2
-        if value > best_value:
-            best, best_value = float(scale), value
-    return best
+def _likeliest_scale(noise: NoiseScale) -> tuple[float, float]:
+    """Scale of the true ones among all pairs remembered, and the logarithm of how much likelier than 1 it is."""
+    gate = np.repeat(noise.gates, [len(z) for z in noise.sigmas])
+    scale, gain = likeliest_scale(np.concatenate(noise.sigmas), gate, _SCALES)
+    return float(scale), float(gain)
