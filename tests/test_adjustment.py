@@ -163,6 +163,33 @@ def test_misidentified_dots_do_not_matter():
     assert 0.9 < out.chi2 / out.dof < 1.1
 
 
+def test_a_frame_whose_targets_are_all_mistaken_is_left_out_and_does_no_harm():
+    rng = np.random.default_rng(0)
+    poses, xyz = scene(rng)
+    seen = dots(rng, poses, xyz)
+    mistaken = seen.frame == 5
+    target = np.where(mistaken, (seen.target + 1) % len(xyz), seen.target)
+    T, X = shaken(rng, poses, xyz)
+    out = adjust(replace(seen, target=target), T, X, rig=RIG)
+    assert np.flatnonzero(~out.is_frame_adjusted).tolist() == [5]
+    assert out.T_world_sensor[5] is T[5]
+    clean = adjust(some(seen, np.flatnonzero(~mistaken)), poses, xyz, rig=RIG)
+    assert np.abs(out.xyz_mm - clean.xyz_mm).max() < 0.005
+
+
+def test_a_target_that_moved_half_way_is_left_out_or_placed_where_it_was():
+    rng = np.random.default_rng(0)
+    poses, xyz = scene(rng)
+    seen = dots(rng, poses, xyz)
+    moved = (seen.target == 3) & (seen.frame >= 6)
+    T, X = shaken(rng, poses, xyz)
+    out = adjust(replace(seen, uv_px=seen.uv_px + 12.0 * moved[:, None]), T, X, rig=RIG)
+    assert out.is_target_adjusted[3] == (out.weight[seen.target == 3] > 0).any()
+    assert out.is_target_adjusted[3] or (out.xyz_mm[3] == X[3]).all()
+    assert np.delete(out.is_target_adjusted, 3).all()
+    assert 0.85 < out.chi2 / out.dof < 1.15
+
+
 def test_targets_seen_by_one_camera_only_are_placed_and_help():
     rng = np.random.default_rng(6)
     poses, xyz = scene(rng)

@@ -23,7 +23,7 @@ MOST_TARGETS = 3000
 """Beyond, the joint covariance takes more than 650 MB and its factorisation minutes."""
 
 _SETTLED = 1e-8  # rms step in standard deviations at which the minimum is reached
-_NEAR = 0.1  # the same at which the robust loss may turn to the one that forgets outliers
+_NEAR = 0.01  # share of the cost that a step still takes when the loss may turn to the one that forgets outliers
 _RADIAL = 0.1  # share of its curvature that a doubted residual keeps along itself
 _NEGLIGIBLE = 1e-6  # expected decrease of the cost that its rounding may hide
 _LEAST_PIVOT = 1e-11  # share of a column's information that the others must leave it
@@ -236,8 +236,9 @@ class _Network:
             camera, measured, cov = np.zeros(len(observations), int), observations.xyz_mm, observations.cov_mm2
             self.rigs, rig_of_frame = (), np.zeros(frames, int)
         self.order = np.lexsort((camera, observations.target, observations.frame))
-        frame, target, camera = (each[self.order] for each in (observations.frame, observations.target, camera))
-        self.measured = measured[self.order]
+        columns = observations.frame, observations.target, camera
+        frame, target, camera = (each[self.order].astype(np.int64) for each in columns)
+        self.measured = measured[self.order].astype(float)
         self.whitening = np.linalg.inv(np.linalg.cholesky(cov[self.order]))  # U with Uᵀ U = C⁻¹
 
         # sightings: one target in one frame, by one camera or both
@@ -575,7 +576,7 @@ class _Search:
     def __init__(self, network: _Network, options: AdjustOptions, start: _State):
         from scipy.special import chdtri
 
-        self.network, self.options, self.state = network, options, start
+        self.network, self.options, self.start, self.state = network, options, start, start
         # as rare for d coordinates as the given number of sigmas is for two
         self.doubt = float(np.sqrt(chdtri(network.measured.shape[1], np.exp(-(options.doubt_sigmas**2) / 2))))
         self.median = float(np.sqrt(chdtri(network.measured.shape[1], 0.5)))
@@ -614,7 +615,7 @@ class _Search:
                 self.solution = self._solve(self._linearise(r, weight, bends=False), 0.0)
                 self.weight = np.where(self.is_active, weight, 0.0)
                 return
-            is_final = is_final or step_sigmas < _NEAR
+            is_final = is_final or solution.decrease <= _NEAR * cost
             damping = damping / 10 if damping > 1e-3 else 0.0
         raise AdjustmentError(f"The adjustment did not settle within {self.options.most_steps} steps.")
 
@@ -816,7 +817,7 @@ class _Search:
             ),
             pose_cov=pose_cov,
             is_frame_adjusted=self.is_frame_in,
-            xyz_mm=state.xyz_mm,
+            xyz_mm=np.where(self.is_target_in[:, None], state.xyz_mm, self.start.xyz_mm),
             map_cov_mm2=map_cov,
             is_target_adjusted=self.is_target_in,
             rig=None if network.rig_unknowns is None else state.rigs[0],
