@@ -355,7 +355,7 @@ def test_a_near_regular_grid_is_positioned_throughout(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(("stated_px", "at_least"), [(0.01, 34), (0.1, 34), (1.0, 30), (None, 34)])
 def test_a_wrongly_stated_noise_is_found_out(stated_px, at_least):
-    """The statue's dots have 0.1 px, a little more where they are seen slantwise; 36 of its first 60 frames are found."""
+    """The statue's dots have 0.1 px, more where they are seen slantwise; 36 of its first 60 frames are found."""
     frames = []
     for frame in simulate_frames("statue", 1, "dots", 60).frames:
         assert isinstance(frame.content, StereoDots)

@@ -8,12 +8,13 @@ import pytest
 from constellations import looking, points_of, scattered, seen_points
 from trifix.errors import ConfigError
 from trifix.geometry.alignment import align_weighted
-from trifix.records import Dots, Fix, PositionedReason, ReferenceMap, StereoMatches
+from trifix.records import Dots, Fix, PositionedReason, ReferenceMap, StereoDots, StereoMatches
 from trifix.stages.weigh import (
     NoiseOptions,
     NoiseScale,
     add_prior_noise,
     scale_points,
+    starting_scale,
     weigh_matches,
     weigh_residuals,
 )
@@ -62,6 +63,38 @@ def test_a_stated_noise_is_kept_unless_it_is_far_off(true_scale: float, is_kept:
     else:
         assert abs(found / true_scale - 1) < 0.15
     assert found_among(true_scale, 0.2, 4, is_stated=False) == pytest.approx(true_scale, rel=0.15)
+
+
+@pytest.mark.parametrize(("true_scale", "is_doubted"), [(10.0, True), (6.0, True), (1.0, False), (0.1, False)])
+def test_a_stated_noise_that_is_far_too_small_is_doubted_at_once(true_scale: float, is_doubted: bool):
+    """Twenty-five pairs, sought at thirty times the stated noise, and ten false ones."""
+    for seed in range(20):
+        rng = np.random.default_rng(seed)
+        z = np.concatenate([rng.normal(0, true_scale, 25), rng.uniform(-30 * GATE, 30 * GATE, 10)])
+        rows = np.zeros(len(z), dtype=np.int64)
+        pairs, wide = StereoMatches(rows, rows, 0.2 * z, np.full(len(z), 0.2)), replace(NoiseScale(), scale=30.0)
+        stated, unstated = (weigh_matches(wide, pairs, GATE, is_stated, OPTIONS) for is_stated in (True, False))
+        assert (stated.is_doubted, stated.is_known, stated.scale) == (is_doubted, False, 30.0)
+        assert not unstated.is_doubted
+
+
+@pytest.mark.parametrize(("sigma_px", "scale"), [(0.01, 30.0), (0.1, 3.0), (0.3, 1.0), (2.0, 1.0)])
+def test_pairs_are_first_sought_as_widely_as_without_a_stated_noise(sigma_px: float, scale: float):
+    dots = Dots.of(np.zeros((5, 2)), sigma_px)
+    assert starting_scale(StereoDots(dots, dots), OPTIONS) == pytest.approx(scale)
+    none = Dots.of(np.zeros((0, 2)))
+    assert starting_scale(StereoDots(none, none), OPTIONS) == 1.0
+
+
+def test_old_residuals_are_forgotten():
+    rng, noise, options = np.random.default_rng(11), NoiseScale(), NoiseOptions(max_samples=400)
+    rows = np.zeros(30, dtype=np.int64)
+    for _ in range(100):
+        pairs = StereoMatches(rows, rows, rng.normal(0, 0.2, 30), np.full(30, 0.2))
+        noise = weigh_matches(noise, pairs, GATE, False, options)
+    assert noise.seen == 3000
+    assert 400 <= sum(map(len, noise.sigmas)) <= 630
+    assert len(noise.gates) == len(noise.sigmas)
 
 
 def test_too_few_pairs_say_nothing():
