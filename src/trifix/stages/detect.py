@@ -9,47 +9,45 @@ from typing import Literal
 
 import cv2
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from trifix.errors import ConfigError
 from trifix.kernels.detection import (
     AROUND,
-    COV_UU,
-    COV_UV,
-    COV_VV,
+    BLOCK_PX,
+    BLUR,
     RESIDUAL,
+    SIGN,
     STEP,
     THETA,
+    UU,
+    VV,
     A,
     B,
     Grey,
     U,
     V,
     blobs,
+    block_extremes,
+    distinct,
     fit_ellipses,
+    noise_samples,
+    share_gradients,
 )
 from trifix.records import Dots, GreyOrColour
 
-_SIGNS = (-1.0, 1.0)  # dark, bright
 # A level of the pyramid answers for blobs from 6.5 to 14 of its own pixels across (the finest also for smaller ones);
 # the limits overlap, since a dot may be measured a little larger or smaller from one level to the next.
-_LEVEL_MIN_PX, _LEVEL_MAX_PX, _WINDOW_PX = 6.5, 14.0, 25
+_LEVEL_MIN_PX, _LEVEL_MAX_PX, _WINDOW_BLOCKS = 6.5, 14.0, 7
 _MIN_FILL = 0.75
 _NOISE_RANGE = 9.0  # standard deviations that noise alone does not span within a window
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class _Level:
-    """One level of the pyramid."""
-
-    grey: Grey
-    """The image."""
-    darkest: Grey
-    """Least grey value in the window about each pixel."""
-    brightest: Grey
-    """Largest grey value in the window about each pixel."""
-    size: int
-    """Side of its pixels (px of the image)."""
+_LAG_PX = 6  # beyond which noise is not correlated
+# A dot whose step is less than _NOISE_RANGE deviations of correlated noise must leave no more than this fraction of it.
+_CLEAN = 0.03
+_QUANTILE = {1.0: 0.6745, 0.5: 0.3186}  # of the magnitude of a normal number: the middle of all, of the lower half
+# Prior knowledge, as standard deviations: relative change of the light per pixel (u, v); departure from light that
+# multiplies both sides of the edge alike, in contrasts per pixel (u, v).
+_GRADIENT_PER_PX = np.array([0.001, 0.001, 0.0007, 0.0007])
 
 
 @dataclass(frozen=True)
@@ -85,105 +83,117 @@ def detect(image: GreyOrColour, options: DetectOptions = DetectOptions()) -> Dot
     """Dots of one image, from top to bottom.
 
     Blobs on the local threshold at every level of a pyramid; then least squares of a blurred ellipse to the grey
-    values, which gives centre, axes and covariance and tells dots from clutter by what it leaves.
+    values, which gives centre, axes and covariance and tells dots from clutter by what it leaves. What shows too large
+    for the image itself is fitted at its level first, where that is cheap.
     """
     grey = np.ascontiguousarray(cv2.cvtColor(image, cv2.COLOR_BGR2GRAY) if image.ndim == 3 else image)
-    levels, noise = list(_pyramid(grey, options)), _noise(grey)
-    signs = _SIGNS if options.polarity == "auto" else (_SIGNS[options.polarity == "bright"],)
-    fits = max(
-        (_fits(grey, levels, noise, sign, options) for sign in signs),
-        key=lambda fits: _evidence(_misfit(fits, noise), options),
+    noise = _noise(grey, 1, 1.0)
+    start = [_candidates(level, size, noise / size, options) for level, size in _pyramid(grey, options)]
+    fits, gradient, information = fit_ellipses(
+        grey,
+        _distinct_starts(np.concatenate([np.zeros((0, BLUR + 1)), *start])),
+        _GRADIENT_PER_PX,
+        options.min_contrast,
+        options.max_misfit,
+        noise,
+        False,
     )
-    fits = fits[np.lexsort((fits[:, U], fits[:, V]))]
-    n = len(fits)
+    row = np.flatnonzero(_is_good(fits, grey, noise, options))
+    misfit = _misfit(fits[row], noise)
+    if options.polarity == "auto":
+        evidence = {sign: _evidence(misfit[fits[row, SIGN] == sign], options) for sign in (-1.0, 1.0)}
+        chosen = fits[row, SIGN] == max(evidence, key=lambda sign: evidence[sign])
+        row, misfit = row[chosen], misfit[chosen]
+    row = row[distinct(fits[row, : V + 1], fits[row, B], np.argsort(misfit, kind="stable"))]
+    row = row[np.lexsort((fits[row, U], fits[row, V]))]
+    refined = share_gradients(fits[row], gradient[row], information[row], _GRADIENT_PER_PX)
+    n = len(row)
     return Dots(
-        uv_px=fits[:, [U, V]],
-        cov_px2=fits[:, [COV_UU, COV_UV, COV_UV, COV_VV]].reshape(n, 2, 2),
-        ellipse=fits[:, [A, B, THETA]],
+        uv_px=refined[:, :2],
+        cov_px2=refined[:, [2, 3, 3, 4]].reshape(n, 2, 2),
+        ellipse=fits[row][:, [A, B, THETA]],
         label=np.full(n, -1),
         row=np.arange(n),
     )
 
 
-def _pyramid(grey: Grey, options: DetectOptions) -> Iterator[_Level]:
-    """The image at halved sizes, as far as dots of the wanted size need them."""
-    window = cv2.getStructuringElement(cv2.MORPH_RECT, (_WINDOW_PX, _WINDOW_PX))
+def _pyramid(grey: Grey, options: DetectOptions) -> Iterator[tuple[Grey, int]]:
+    """The image at halved sizes, as far as dots of the wanted size need them, and the side of their pixels (px)."""
     size = 1
-    while size == 1 or (_LEVEL_MIN_PX * size <= options.max_diameter_px and min(grey.shape) > _LEVEL_MIN_PX):
-        if size > 1:
-            h, w = grey.shape
-            grey = cv2.resize(grey[: h - h % 2, : w - w % 2], (w // 2, h // 2), interpolation=cv2.INTER_AREA)
+    while min(grey.shape) >= 2 * BLOCK_PX and (size == 1 or _LEVEL_MIN_PX * size <= options.max_diameter_px):
         if _LEVEL_MAX_PX * size >= options.min_diameter_px:
-            yield _Level(grey, cv2.erode(grey, window), cv2.dilate(grey, window), size)
+            yield grey, size
+        h, w = grey.shape
+        grey = cv2.resize(grey[: h - h % 2, : w - w % 2], (w // 2, h // 2), interpolation=cv2.INTER_AREA)
         size *= 2
 
 
-def _candidates(
-    levels: list[_Level], noise: float, sign: float, options: DetectOptions
-) -> tuple[Float[np.ndarray, "m 5"], Float[np.ndarray, "m"]]:
-    """Centre and second moments (px, px²) of elliptic blobs, and how far off they may be (px)."""
+def _candidates(level: Grey, size: int, noise: float, options: DetectOptions) -> Float[np.ndarray, "m 7"]:
+    """Elliptic blobs of one level of the pyramid (px of the image), of the wanted polarity."""
     # The short axis of the smallest dot, less what a blob of few pixels may lose.
     least_px = 0.7 * options.min_diameter_px * np.sqrt(options.min_axis_ratio)
-    start, coarseness = [np.zeros((0, 5))], [np.zeros(0)]
-    for level in levels:
-        found = blobs(
-            level.grey,
-            level.darkest,
-            level.brightest,
-            sign,
-            options.min_contrast,
-            _NOISE_RANGE * noise / level.size,
-            max(least_px / level.size, 0.0 if level.size == 1 else _LEVEL_MIN_PX),
-            _LEVEL_MAX_PX,
-            0.9 * options.min_axis_ratio,
-            _MIN_FILL,
-        ) * np.array([level.size] * 2 + [level.size**2] * 3)
-        found[:, :2] += (level.size - 1) / 2
-        start.append(found)
-        coarseness.append(np.full(len(found), (level.size - 1) / 2))
-    return np.concatenate(start), np.concatenate(coarseness)
+    low, high = block_extremes(level)
+    window = cv2.getStructuringElement(cv2.MORPH_RECT, (_WINDOW_BLOCKS, _WINDOW_BLOCKS))
+    found = blobs(
+        level,
+        *(low, high, cv2.erode(low, window), cv2.dilate(high, window)),
+        options.min_contrast,
+        _NOISE_RANGE * noise,
+        max(least_px / size, 0.0 if size == 1 else _LEVEL_MIN_PX),
+        _LEVEL_MAX_PX,
+        0.9 * options.min_axis_ratio,
+        _MIN_FILL,
+    )
+    if options.polarity != "auto":
+        found = found[found[:, SIGN] == (1.0 if options.polarity == "bright" else -1.0)]
+    if size == 1 or len(found) == 0:
+        return found
+    prior = _GRADIENT_PER_PX * size
+    found = fit_ellipses(level, found, prior, options.min_contrast, 2 * options.max_misfit, noise, True)[0][
+        :, : BLUR + 1
+    ]
+    found = found[np.isfinite(found[:, U])]
+    found[:, [U, V]] = size * found[:, [U, V]] + (size - 1) / 2
+    found[:, UU : VV + 1] *= size**2
+    found[:, BLUR] = 0.8
+    return found
 
 
-def _fits(
-    grey: Grey, levels: list[_Level], noise: float, sign: float, options: DetectOptions
-) -> Float[np.ndarray, "n 12"]:
-    """Accepted fits of one polarity."""
-    start, coarseness = _candidates(levels, noise, sign, options)
-    fits = fit_ellipses(grey, start, coarseness, sign, options.min_contrast, options.max_misfit, noise)
-    fits = fits[np.isfinite(fits[:, U])]
+def _distinct_starts(start: Float[np.ndarray, "m 7"]) -> Float[np.ndarray, "k 7"]:
+    """The starts without any that another level gave already, unless of other size or polarity."""
+    kept = np.zeros(len(start), dtype=bool)
+    for sign in (-1.0, 1.0):
+        rows = np.flatnonzero(start[:, SIGN] == sign)
+        reach = 0.25 * (start[rows, UU] + start[rows, VV]) ** 0.5
+        kept[rows[distinct(start[rows, : V + 1], reach, np.arange(len(rows)))]] = True
+    return start[kept]
+
+
+def _is_good(
+    fits: Float[np.ndarray, "m 17"], grey: Grey, noise: float, options: DetectOptions
+) -> Bool[np.ndarray, "m"]:
+    """Whether a fit is that of a dot as the options want it, whole within the image.
+
+    Lumps of correlated noise look like faint dots, but none is clean.
+    """
     u, v, a, b = fits[:, U], fits[:, V], fits[:, A], fits[:, B]
-    around, step = fits[:, AROUND], np.abs(fits[:, STEP])
+    around, step, misfit = fits[:, AROUND], fits[:, STEP], _misfit(fits, noise)
     h, w = grey.shape
-    good = (
+    return np.asarray(
         (2 * a >= options.min_diameter_px)
         & (2 * a <= options.max_diameter_px)
         & (b >= options.min_axis_ratio * a)
-        & (step >= options.min_contrast * np.maximum(around, around + sign * step))
-        & (_misfit(fits, noise) <= options.max_misfit)
+        & (np.abs(step) >= options.min_contrast * np.maximum(around, around + step))
+        & (misfit <= np.where(np.abs(step) < _NOISE_RANGE * _noise(grey, _LAG_PX, 0.5), _CLEAN, options.max_misfit))
         & (np.minimum(u, v) >= a)
         & (u + a <= w - 1)
         & (v + a <= h - 1)
     )
-    return _distinct(fits[good], noise)
 
 
-def _misfit(fits: Float[np.ndarray, "n 12"], noise: float) -> Float[np.ndarray, "n"]:
+def _misfit(fits: Float[np.ndarray, "m 17"], noise: float) -> Float[np.ndarray, "m"]:
     """Residual beyond the noise, as a fraction of the step."""
     return np.asarray(np.sqrt(np.maximum(fits[:, RESIDUAL] ** 2 - noise**2, 0.0)) / np.abs(fits[:, STEP]))
-
-
-def _distinct(fits: Float[np.ndarray, "n 12"], noise: float) -> Float[np.ndarray, "k 12"]:
-    """The fits without the worse of any two whose centres lie within the short axis of one of them."""
-    order = np.argsort(_misfit(fits, noise), kind="stable")
-    fits = fits[order]
-    close = np.hypot(*(fits[:, None, :2] - fits[None, :, :2]).transpose(2, 0, 1)) < np.maximum(
-        fits[:, None, B], fits[None, :, B]
-    )
-    kept = np.ones(len(fits), dtype=bool)
-    for k in range(len(fits)):
-        if kept[k]:
-            kept[k + 1 :] &= ~close[k, k + 1 :]
-    return fits[kept]
 
 
 def _evidence(misfit: Float[np.ndarray, "n"], options: DetectOptions) -> float:
@@ -195,15 +205,14 @@ def _evidence(misfit: Float[np.ndarray, "n"], options: DetectOptions) -> float:
     return float(np.sum((1 - misfit / options.max_misfit) ** 2))
 
 
-def _noise(grey: Grey) -> float:
-    """Standard deviation of the image's noise (grey values).
+def _noise(grey: Grey, lag_px: int, share: float) -> float:
+    """Standard deviation of the noise (grey values), as the quietest ``share`` of the image has it.
 
-    Immerkær's difference of two Laplacians (1996), which is blind to slopes, on every eighth row; its median instead of
-    its mean is blind to edges too. Texture of a pixel's size counts as noise.
+    A lag of 1 px tells the noise of single pixels, a long one also noise that neighbours have in common.
     """
-    if min(grey.shape) < 3:
+    if min(grey.shape) <= 2 * lag_px:
         return 0.0
-    rows = [grey[i : len(grey) - 2 + i : 8].astype(np.float32) for i in range(3)]
-    across = rows[0] - 2 * rows[1] + rows[2]
-    mask = across[:, :-2] - 2 * across[:, 1:-1] + across[:, 2:]
-    return float(np.median(np.abs(mask))) / (0.6745 * 6)
+    samples = noise_samples(grey, lag_px)
+    k = int(0.5 * share * len(samples))
+    # The middle of those, in standard deviations of one normal number.
+    return float(np.partition(samples, k)[k]) / (6 * _QUANTILE[share])
