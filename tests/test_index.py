@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from tests.constellations import front_map, looking, noise, points_of, scattered, sensor_covariances, some_points
 
+from constellations import front_map, looking, noise, points_of, scattered, sensor_covariances, some_points
+from trifix.geometry.alignment import align
 from trifix.index import Candidates, MapIndex, frame_triangles
 from trifix.records import ReferenceMap, SensorPoints, TargetState
 
@@ -273,6 +274,26 @@ def random_sheet(rng: np.random.Generator, n: int, is_regular: bool) -> Referenc
     map = front_map(xyz, 0.02)
     map.view[rng.choice(n, n // 8)] = np.nan
     return map
+
+
+def test_a_true_triangle_is_among_the_first_even_with_strays():
+    hits = 0
+    for seed in range(40):
+        rng = np.random.default_rng(seed)
+        map = random_sheet(rng, 300, is_regular=False)
+        index = indexed(map)
+        middle = np.linalg.norm(map.xyz_mm - map.xyz_mm.mean(axis=0), axis=1)
+        points = sighting(rng, map, rng.choice(np.argsort(middle)[:18], 16, replace=False), strays=6)
+        frame = frame_triangles(points.xyz_mm, points.cov_mm2)
+        assert np.bincount(frame[:6].ravel()).max() <= 3  # points take turns
+        found = index.local(points, map, frame[:12], 3.0, 0.0, 99)
+        for p, q in zip(found.point, found.target, strict=True):
+            T = align(points.xyz_mm[p], map.xyz_mm[q])
+            apart = np.linalg.norm(T.apply(points.xyz_mm)[:, None] - map.xyz_mm, axis=2).min(axis=1)
+            if np.count_nonzero(apart < 2.0) >= 8:
+                hits += 1
+                break
+    assert hits >= 36
 
 
 def test_equilateral_triangles_keep_the_three_orders_that_handedness_allows():

@@ -15,7 +15,7 @@ from trifix.records import ReferenceMap, SensorPoints, TargetState
 _ALIVE = int(TargetState.trusted)  # states up to this one are indexed
 _SAMPLE = 64  # targets from which the spacing is judged
 _SPACING_RATIO = 1.5  # a spacing that is off by more is corrected
-_SLACK_CELLS = 1 / 400  # of a cell's width: an eighth of a cell of sides, microns to tenths of a millimetre
+_SLACK_CELLS = 1 / 800  # of a cell's width: what a target moves by once it was seen a few times
 _FLOAT32_STEP = 2.0**-22  # anchors must not leave their slack by rounding
 
 
@@ -50,16 +50,24 @@ class MapIndex:
         self._triangles = 0
         self._scaled_for = 0  # targets when the scales and the tables' sizes were chosen
         self._widest_mm2 = 0.0  # no target's covariance has a larger trace
+        self._given = 0  # rows looked at since all were
         self._version = 0
         self._pairs: tuple[int, kernels.PairTable] | None = None  # made at this version
 
     def follow(self, map: ReferenceMap, rows: Int[np.ndarray, "r"] | None = None) -> None:
-        """Brings the index up to date with the map; ``rows`` are the only ones that may have changed, if given."""
+        """Brings the index up to date with the map; ``rows`` are the only ones that may have changed, if given.
+
+        Once as many were given as there are, all are looked at: the bound on their covariances is renewed.
+        """
         self._make_room(len(map))
         store = self._store
-        among = np.arange(len(store.id)) if rows is None else rows
-        changed, widest = kernels.changed_rows(store, among, map.id, map.state, map.xyz_mm, map.cov_mm2, _ALIVE)
-        self._widest_mm2 = widest if rows is None else max(self._widest_mm2, widest)
+        self._given += 0 if rows is None else len(rows)
+        if rows is None or self._given > len(map):
+            rows = np.arange(len(store.id))
+            self._given = 0
+            self._widest_mm2 = 0.0
+        changed, widest = kernels.changed_rows(store, rows, map.id, map.state, map.xyz_mm, map.cov_mm2, _ALIVE)
+        self._widest_mm2 = max(self._widest_mm2, widest)
         if len(changed) == 0:
             return
         self._version += 1

@@ -15,7 +15,7 @@ PAIRS = 28
 """Pairs of eight neighbours: the triangles that one target may own."""
 
 _REACH_CELLS = 4  # neighbours are sought within so many cells
-_SIDE_CELLS = 48.0  # cells of sides to one of space: few triangles in each, few cells to a look-up
+_SIDE_CELLS = 96.0  # cells of sides to one of space: few triangles in each, few cells to a look-up
 _SLENDER = 0.15  # triangles whose altitude is a smaller part of their longest side are left out
 _EDGE_ON_SINE = 0.34202014332566873  # sin 20°: nearer to edge-on the handedness of a triangle is not trusted
 _ORDERS = np.array([[0, 1, 2], [1, 2, 0], [2, 0, 1], [0, 2, 1], [2, 1, 0], [1, 0, 2]])  # even ones first
@@ -375,7 +375,7 @@ def link_all(store: Store) -> None:
 
 @njit(cache=True, nogil=True)
 def distances_to_third(xyz: Float[np.ndarray, "k 3"], rows: Int[np.ndarray, "a"], every: int) -> Float[np.ndarray, "s"]:
-    """Distance from one of ``every`` so many rows to the third nearest of the others; infinite where there are fewer."""
+    """Distance from one of ``every`` so many rows to the third nearest other; infinite where there are fewer."""
     sample = rows[::every]
     out = np.empty(len(sample))
     for n in range(len(sample)):
