@@ -6,7 +6,7 @@ UV := $(V)/bin/uv
 LOCKED = $(UV) pip compile -q pyproject.toml --all-extras --group dev --universal \
          --generate-hashes --no-emit-index-url --no-header --no-annotate
 
-.PHONY: setup demo test check lock check-lock
+.PHONY: setup demo test check bench lock check-lock
 .DEFAULT_GOAL := test
 
 setup: $(V)/.stamp
@@ -39,6 +39,11 @@ check: setup check-lock
 	$(V)/bin/lint-imports
 	$(V)/bin/trifix warmup
 	$(V)/bin/python -m pytest -q -n 2 --cov --cov-report=term:skip-covered
+
+# Short runs against benchmarks/baseline.json; the long ones are in benchmarks/README.md.
+bench: setup
+	$(V)/bin/trifix warmup
+	$(V)/bin/python benchmarks/bench.py
 
 # The newest releases that pyproject.toml allows and the lock file does not hold yet change nothing here.
 lock: setup

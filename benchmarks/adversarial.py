@@ -30,7 +30,6 @@ from collections.abc import Callable, Mapping
 from dataclasses import replace
 from itertools import starmap
 from pathlib import Path
-from typing import Annotated
 
 import cyclopts
 import matplotlib as mpl
@@ -73,7 +72,7 @@ def main(
     seed: int = 1,
     shard: int = 1000,
     jobs: int = 1,
-    option: Annotated[tuple[str, ...], cyclopts.Parameter(negative=())] = (),
+    option: tuple[str, ...] = (),
 ) -> None:
     """Runs the frames and writes adversarial.json and adversarial.png.
 
@@ -152,7 +151,7 @@ def judged(task: shards.Task) -> dict[str, object]:
                     pose = fix.rivals[0].T_world_sensor
                 elif fix.weak is not None:
                     pose = fix.weak.T_world_sensor
-                elif fix.why is Reason.not_proven and batch.pose_of_labels(k, world.map) is not None:
+                elif fix.why is Reason.not_proven and batch.is_positionable(k, world.map):
                     again = unbiased.step(frame).fix
                     if isinstance(again, Fix):
                         pose, p_chance = again.T_world_sensor, again.p_chance
@@ -177,8 +176,11 @@ def judged(task: shards.Task) -> dict[str, object]:
 
 def is_fix_right(batch: Batch, k: int, fix: Fix, world: World) -> bool:
     """Whether a fix is right by the pose of the true labels, or by its pairs where these lie on a line."""
-    if batch.pose_of_labels(k, world.map) is None:
-        return batch.true_pairs(k, fix) == len(fix.point)
+    are_pairs_true = batch.true_pairs(k, fix) == len(fix.point)
+    if are_pairs_true and len(fix.point) == len(batch.labelled(k)):
+        return True  # it is that pose
+    if not batch.is_positionable(k, world.map):
+        return are_pairs_true
     return batch.is_right(k, fix.T_world_sensor, world.map)
 
 

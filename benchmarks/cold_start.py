@@ -9,8 +9,8 @@ counts when at least 40 % of the frame's points, and five, agree with it; trifix
 
 - trifix: the complete step, from points to fix. Where the step says when its first hypothesis was verified, under
   ``first_verified`` among its timings, that time stands in a row of its own.
-- cliquematch: the largest clique of pairs whose distances agree (``A2AGraph``); bounded below by the points that must
-  agree, without its heuristic, which is faster here.
+- cliquematch: the largest clique of pairs whose distances agree (``A2AGraph``), bounded below by the points that must
+  agree.
 - KISS-Matcher: prune and solve over all pairs of a point and a target.
 - Open3D: RANSAC over the same pairs, with its tests of edges and distances.
 - pair table: our own plain one. Distances of all targets to their 40 nearest, sorted; a triangle of the frame is
@@ -22,8 +22,9 @@ import json
 import os
 import warnings
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
+from functools import partial
 from math import ceil
 from pathlib import Path
 from time import perf_counter
@@ -34,10 +35,11 @@ import shards
 from adversarial import patch
 from made_frames import GAP_NS, MOST, Batch, World, made_world, measured
 from numba import njit
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeRemainingColumn
 from scipy.spatial import cKDTree
 
 from trifix import Config, Fix, Positioner
+from trifix.config import with_overrides
 from trifix.geometry.alignment import align
 from trifix.geometry.pose import Pose
 from trifix.records import Frame, ReferenceMap, SensorPoints
@@ -83,10 +85,10 @@ def must_agree(n: int) -> int:
 class Trifix:
     """The whole step, each frame too long after the last for the motion to say anything."""
 
-    name, largest = "trifix", 10**9
+    name = "trifix"
 
-    def __init__(self, map: ReferenceMap) -> None:
-        self.positioner = Positioner(Config(), map=map, is_map_frozen=True)
+    def __init__(self, map: ReferenceMap, config: Config) -> None:
+        self.positioner = Positioner(config, map=map, is_map_frozen=True)
         self.frames = 0
 
     def __call__(self, points: SensorPoints) -> Answer:
@@ -115,7 +117,7 @@ class Cliquematch:
         graph.epsilon = TOLERANCE_MM
         graph.build_edges()
         try:
-            point, target = graph.get_correspondence(lower_bound=must_agree(len(points)) - 1, use_heuristic=False)
+            point, target = graph.get_correspondence(lower_bound=must_agree(len(points)) - 1)
         except RuntimeError:  # no clique as large
             return Answer(None)
         return Answer(align(points.xyz_mm[point], self.xyz[target]))
@@ -262,7 +264,7 @@ def settled(tree: cKDTree, points: SensorPoints, pose: Pose) -> Answer:
     return Answer(align(points.xyz_mm[point], tree.data[target[point]]))
 
 
-METHODS = (Trifix, Cliquematch, KissMatcher, Open3d, PairTable)
+PEERS = (Cliquematch, KissMatcher, Open3d, PairTable)
 
 
 @dataclass(slots=True)
@@ -287,6 +289,7 @@ def main(
     budget_s: float = 60.0,
     seed: int = 1,
     without: tuple[str, ...] = (),
+    option: tuple[str, ...] = (),
 ) -> None:
     """Runs the queries and writes cold_start.json and cold_start.md.
 
@@ -298,8 +301,11 @@ def main(
     budget_s: time that each may use with a map, after which it gets no more queries.
     seed: of all random numbers.
     without: names of those to leave out.
+    option: options of trifix, such as identify.technique=minimal.
     """
-    summary = measure(sizes, queries, budget_s, seed, without)
+    one_core()
+    config = with_overrides(Config(), dict(each.split("=", 1) for each in option))
+    summary = measure(sizes, queries, budget_s, seed, without, config)
     out.mkdir(parents=True, exist_ok=True)
     (out / "cold_start.json").write_text(json.dumps(summary, indent=1) + "\n")
     text = markdown(summary)
@@ -308,12 +314,16 @@ def main(
 
 
 def measure(
-    sizes: tuple[int, ...], queries: int, budget_s: float, seed: int, without: tuple[str, ...] = ()
+    sizes: tuple[int, ...],
+    queries: int,
+    budget_s: float,
+    seed: int,
+    without: tuple[str, ...],
+    config: Config,
 ) -> dict[str, object]:
     """The numbers of a run."""
-    one_core()
-    missing = [m.name for m in METHODS if hasattr(m, "module") and importlib.util.find_spec(m.module) is None]
-    chosen = [method for method in METHODS if method.name not in (*missing, *without)]
+    missing = [m.name for m in PEERS if hasattr(m, "module") and importlib.util.find_spec(m.module) is None]
+    chosen = [method for method in PEERS if method.name not in (*missing, *without)]
     rows: list[dict[str, object]] = []
     progress = Progress(
         TextColumn("{task.description}"),
@@ -328,7 +338,10 @@ def measure(
             bar = progress.add_task(f"{n} targets: making maps", total=queries)
             rng = np.random.default_rng([seed, n])
             world, batch = made_queries(rng, n, queries)
-            records = asked(world, batch, [m for m in chosen if n <= m.largest], budget_s, progress, bar, n)
+            methods = {m.name: m for m in chosen if n <= m.largest}
+            if Trifix.name not in without:
+                methods = {Trifix.name: partial(Trifix, config=config), **methods}
+            records = asked(world, batch, methods, budget_s, progress, bar, n)
             rows += [row for name, record in records.items() for row in figures(n, name, record)]
     progress.console.print(
         f"{queries * len(sizes)} queries, {queries * len(sizes) / (perf_counter() - start):.1f} a second"
@@ -357,17 +370,23 @@ def made_queries(rng: np.random.Generator, n: int, f: int) -> tuple[World, Batch
 
 
 def asked(
-    world: World, batch: Batch, methods: list[type], budget_s: float, progress: Progress, bar: int, n: int
+    world: World,
+    batch: Batch,
+    methods: Mapping[str, Callable[[ReferenceMap], Solver]],
+    budget_s: float,
+    progress: Progress,
+    bar: TaskID,
+    n: int,
 ) -> dict[str, Record]:
     """Everybody's record over the same frames in the same order."""
     records: dict[str, Record] = {}
     solvers: dict[str, Solver] = {}
-    for method in methods:
-        progress.update(bar, description=f"{n} targets: {method.name} prepares")
+    for name, prepare in methods.items():
+        progress.update(bar, description=f"{n} targets: {name} prepares")
         start = perf_counter()
-        solvers[method.name] = method(world.map)
-        records[method.name] = Record(perf_counter() - start)
-        solvers[method.name](batch.points(0))  # compiled, and in the cache
+        solvers[name] = prepare(world.map)
+        records[name] = Record(perf_counter() - start)
+        solvers[name](batch.points(0))  # compiled, and in the cache
     for k in range(len(batch)):
         points = batch.points(k)
         for name, solver in solvers.items():

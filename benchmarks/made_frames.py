@@ -69,16 +69,24 @@ class Batch:
         for k in range(len(self)):
             yield Frame(k, k * GAP_NS, None, self.points(k))
 
+    def labelled(self, k: int) -> Int[np.ndarray, "c"]:
+        """Rows of the frame's points that are targets of the map."""
+        return np.flatnonzero(self.label[k, : self.count[k]] >= 0)
+
+    def is_positionable(self, k: int, map: ReferenceMap) -> bool:
+        """Whether the frame's true labels say what its pose is."""
+        return spread_off_line_mm(map.xyz_mm[self.label[k, self.labelled(k)]]) >= OFF_LINE_MM
+
     def pose_of_labels(self, k: int, map: ReferenceMap) -> tuple[Pose, Float[np.ndarray, "6 6"], float] | None:
         """The pose that the frame's true labels give against the map, and its covariance; None if they give none.
 
         The last value is their chi-square per freedom. Where it exceeds one, the points' errors are larger than stated,
         as those of a sensor of wrong scale, and so is sigma: ``trifix evaluate`` reckons the same way.
         """
-        point = np.flatnonzero(self.label[k, : self.count[k]] >= 0)
-        target = self.label[k, point]
-        if spread_off_line_mm(map.xyz_mm[target]) < OFF_LINE_MM:
+        if not self.is_positionable(k, map):
             return None
+        point = self.labelled(k)
+        target = self.label[k, point]
         b, a = self.xyz_mm[k, point], map.xyz_mm[target]
         C_b, C_a = self.cov_mm2[k, point], map.cov_mm2[target]
         T, cov = align_weighted(b, a, C_b, C_a, initial=align(b, a))
