@@ -95,7 +95,7 @@ class MapIndex:
         and they are not known to be seen from different sides. Every order of vertices in which they do counts. The
         search ends after the triangle at which ``limit`` pairs are reached.
         """
-        found, tried, by_chance = kernels.match_local(
+        (point, target, row), tried, by_chance = kernels.match_local(
             self._store,
             frame_triangles,
             points.xyz_mm,
@@ -108,7 +108,7 @@ class MapIndex:
             tolerance_mm,
             limit,
         )
-        return Candidates(found[:, :3], found[:, 3:6], found[:, 6], tried, by_chance)
+        return Candidates(point, target, row, tried, by_chance)
 
     def any(
         self,
@@ -129,7 +129,7 @@ class MapIndex:
         if table is None:
             none = np.zeros((0, 3), dtype=np.int64)
             return Candidates(none, none, none[:, 0], 0, 0.0, is_cut=True)
-        found, tried, by_chance, is_cut = kernels.match_any(
+        (point, target, row), tried, by_chance, is_cut = kernels.match_any(
             self._store,
             table,
             frame_triangles,
@@ -144,7 +144,7 @@ class MapIndex:
             limit,
             max_comparisons,
         )
-        return Candidates(found[:, :3], found[:, 3:6], found[:, 6], tried, by_chance, is_cut)
+        return Candidates(point, target, row, tried, by_chance, is_cut)
 
     @property
     def grid(

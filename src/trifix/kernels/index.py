@@ -10,6 +10,8 @@ import numpy as np
 from jaxtyping import Float, Float32, Int, Int32
 from numba import njit
 
+Pairs = tuple[Int[np.ndarray, "h 3"], Int[np.ndarray, "h 3"], Int[np.ndarray, "h"]]
+
 NEIGHBOURS = 8
 PAIRS = 28
 """Pairs of eight neighbours: the triangles that one target may own."""
@@ -458,6 +460,11 @@ def _append(found, count, p, q, order, row):
 
 
 @njit(cache=True, nogil=True)
+def _columns(found):
+    return found[:, :3].copy(), found[:, 3:6].copy(), found[:, 6].copy()
+
+
+@njit(cache=True, nogil=True)
 def _typical_variance(store, cov):
     """The variance of a side between two typical targets of the map, from a sample of them."""
     total, count = 0.0, 0
@@ -484,8 +491,8 @@ def match_local(
     sigmas: float,
     floor_mm: float,
     limit: int,
-) -> tuple[Int[np.ndarray, "h 7"], int, float]:
-    """Pairs of a frame's triangles with congruent ones of the table: three points, three targets, row of the triangle.
+) -> tuple[Pairs, int, float]:
+    """Pairs of a frame's triangles with congruent ones of the table: points, targets, row of the frame's triangle.
 
     Ends after the triangle at which ``limit`` pairs are reached. Returns also how many were looked up, and how many
     pairs chance would have brought: as many as the tolerances' share of the side space that was visited, and of the
@@ -565,7 +572,7 @@ def match_local(
                         count += 1
         if cells > 0:
             by_chance += met * min(box / cells, 1.0)
-    return found[:count], tried, by_chance
+    return _columns(found[:count]), tried, by_chance
 
 
 # --- any three targets -----------------------------------------------------------------------------------------------
@@ -663,7 +670,7 @@ def match_any(
     floor_mm: float,
     limit: int,
     max_comparisons: int,
-) -> tuple[Int[np.ndarray, "h 7"], int, float, bool]:
+) -> tuple[Pairs, int, float, bool]:
     """The pairs of ``match_local`` with any three targets; and whether ``max_comparisons`` ended the search.
 
     The frame's longest side is laid on every pair of targets that is as long, both ways round; third targets are
@@ -725,7 +732,7 @@ def match_any(
         for s in range(3):
             box *= 2 * (floor_mm + sigmas * np.sqrt(var[s] + typical))
         by_chance += met * min(box / volume, 1.0)
-    return found[:count], tried, by_chance, is_cut
+    return _columns(found[:count]), tried, by_chance, is_cut
 
 
 # --- triangles of a frame --------------------------------------------------------------------------------------------
