@@ -374,6 +374,15 @@ def test_targets_known_beforehand_are_the_world():
     assert low < np.sum(of_map) < high
 
 
+def test_targets_known_far_better_than_they_are_seen_settle_too():
+    rng = np.random.default_rng(18)
+    poses, xyz = scene(rng)
+    gauge = ControlTargets(np.arange(6), xyz[:6], np.tile(1e-16 * np.eye(3), (6, 1, 1)))
+    out = adjust(dots(rng, poses, xyz), *shaken(rng, poses, xyz), rig=RIG, gauge=gauge)
+    assert np.abs(out.xyz_mm[:6] - xyz[:6]).max() < 1e-7
+    assert out.steps < 15
+
+
 def test_a_map_known_exactly_stays_and_places_every_frame_by_itself():
     rng = np.random.default_rng(8)
     poses, xyz = scene(rng)
@@ -446,6 +455,8 @@ def test_nonsense_is_refused_in_a_sentence():
     broken, flat = seen.uv_px.copy(), seen.cov_px2.copy()
     broken[7], flat[9] = np.nan, 0.0
     many = np.zeros((3001, 3))
+    away = [T @ Pose.exp(np.array([0, 0, 0, np.pi, 0, 0])) for T in poses]
+    twice = ControlTargets(np.array([1, 1]), xyz[:2], np.zeros((2, 3, 3)))
     for match, wrong in [
         ("no observation was given", lambda: adjust(none, poses, xyz, rig=RIG)),
         ("3001 targets are too many", lambda: adjust(seen, poses, many, rig=RIG)),
@@ -456,6 +467,8 @@ def test_nonsense_is_refused_in_a_sentence():
         ("Observation 7 holds", lambda: adjust(replace(seen, uv_px=broken), poses, xyz, rig=RIG)),
         ("observation 9 is not positive", lambda: adjust(replace(seen, cov_px2=flat), poses, xyz, rig=RIG)),
         ("two different targets", lambda: adjust(seen, poses, xyz, rig=RIG, scale_bars=[ScaleBar(1, 1, 5.0, 0.1)])),
+        ("in front of the camera", lambda: adjust(seen, away, xyz, rig=RIG)),
+        ("known twice", lambda: adjust(seen, poses, xyz, rig=RIG, gauge=twice)),
         ("can be refined", lambda: adjust(points(rng, poses, xyz), poses, xyz, refine_rig=RigSigmas())),
     ]:
         with pytest.raises(AdjustmentError, match=match):

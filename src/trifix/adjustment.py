@@ -23,6 +23,7 @@ MOST_TARGETS = 3000
 """Beyond, the joint covariance takes more than 650 MB and its factorisation minutes."""
 
 _SETTLED = 1e-8  # rms step in standard deviations at which the minimum is reached
+_ROUNDED = 1e-5  # the same, where steps no longer shrink because rounding makes them
 _NEAR = 0.01  # share of the cost that a step still takes when the loss may turn to the one that forgets outliers
 _RADIAL = 0.1  # share of its curvature that a doubted residual keeps along itself
 _NEGLIGIBLE = 1e-6  # expected decrease of the cost that its rounding may hide
@@ -353,6 +354,8 @@ def _check(
         named.append(("camera", observations.camera, 2))
     if isinstance(gauge, ControlTargets):
         named.append(("known target", gauge.target, targets))
+        if len(np.unique(gauge.target)) < len(gauge.target):
+            raise AdjustmentError("A target is known twice: give each of the known targets one place.")
         is_exact = np.all(gauge.cov_mm2 == 0, axis=(1, 2))
         _check_numbers("known target", gauge.xyz_mm, np.where(is_exact[:, None, None], np.eye(3), gauge.cov_mm2))
     else:
@@ -509,8 +512,11 @@ class _Loss:
     """
 
     a: float
+    """Up to here a residual counts in full."""
     b: float
+    """Up to here it pulls as much as one of length a."""
     c: float
+    """From here on it does not pull."""
 
     def weight(self, s: Float[np.ndarray, "m"]) -> Float[np.ndarray, "m"]:
         """ψ(s) / s."""
@@ -590,7 +596,9 @@ class _Search:
         r = self.network.residuals(self.state)
         s = np.linalg.norm(r, axis=1)
         self.is_active = np.isfinite(s)  # what lies behind a camera at the start has nothing to say
-        scale, damping, is_final = np.inf, 0.0, False
+        if not self.is_active.any():
+            raise AdjustmentError("At the poses given, no target lies in front of the camera that saw it.")
+        scale, damping, last_sigmas, is_final = np.inf, 0.0, np.inf, False
         while self.steps < self.options.most_steps:
             self.steps += 1
             if not is_final:
@@ -610,11 +618,13 @@ class _Search:
                     raise AdjustmentError("The adjustment found no way down: the poses given are too far from right.")
             self.state = candidate
             step_sigmas = float(np.sqrt(solution.decrease / self.unknowns))
-            if is_final and damping == 0 and step_sigmas < _SETTLED:
+            is_rounding = last_sigmas / 2 < step_sigmas < _ROUNDED
+            if is_final and damping == 0 and (step_sigmas < _SETTLED or is_rounding):
                 self.s, weight = s, loss.weight(s)
                 self.solution = self._solve(self._linearise(r, weight, bends=False), 0.0)
                 self.weight = np.where(self.is_active, weight, 0.0)
                 return
+            last_sigmas = step_sigmas
             is_final = is_final or solution.decrease <= _NEAR * cost
             damping = damping / 10 if damping > 1e-3 else 0.0
         raise AdjustmentError(f"The adjustment did not settle within {self.options.most_steps} steps.")
@@ -680,13 +690,6 @@ class _Search:
         network, state = self.network, self.state
         p = network.in_sensor_mm(state)
         J, J_rig = network.jacobians(state, p)
-        if bends:
-            doubted = np.flatnonzero(self.is_active & (weight > 0) & (weight < 1))
-            along = r[doubted] / np.linalg.norm(r[doubted], axis=1, keepdims=True)
-            shrink = np.eye(r.shape[1]) - (1 - np.sqrt(_RADIAL)) * along[:, :, None] * along[:, None, :]
-            J, J_rig, r = J.copy(), J_rig.copy(), r.copy()
-            J[doubted], J_rig[doubted] = shrink @ J[doubted], shrink @ J_rig[doubted]
-            r[doubted] /= np.sqrt(_RADIAL)  # so that Jᵀ r stays
         n, q = len(p), J_rig.shape[2]
         A, b, C = np.empty((n, 3, 3)), np.empty((n, 3)), np.zeros((n, 3, q))
         distance = np.linalg.norm(p, axis=1)
@@ -711,6 +714,14 @@ class _Search:
             is_sighting_in = is_frame_in[network.frame] & is_target_in[network.target]
             self.is_active &= is_sighting_in[network.sighting]
         self._number()
+        if bends:
+            doubted = np.flatnonzero((used > 0) & (used < 1))
+            along = r[doubted] / np.linalg.norm(r[doubted], axis=1, keepdims=True)
+            shrink = np.eye(r.shape[1]) - (1 - np.sqrt(_RADIAL)) * along[:, :, None] * along[:, None, :]
+            J, J_rig, r = J.copy(), J_rig.copy(), r.copy()
+            J[doubted], J_rig[doubted] = shrink @ J[doubted], shrink @ J_rig[doubted]
+            r[doubted] /= np.sqrt(_RADIAL)  # so that Jᵀ r stays
+            kernels.condense(network.observation_start, J, r, used, A, b)
         H_rig, g_rig = np.zeros((q, q)), np.zeros(q)
         if q:
             kernels.condense_rig(network.observation_start, J, J_rig, r, used, C, H_rig, g_rig)
@@ -730,12 +741,10 @@ class _Search:
         if not self.unknowns:
             raise AdjustmentError("There is nothing to adjust: no frame saw enough targets to hold its pose.")
         # the columns that each pose is coupled to: three a sighting, then the rig's
-        of_sighting = self.column[network.target][:, None] + np.where(self.column[network.target] >= 0, 1, 0)[
-            :, None
-        ] * [0, 1, 2]
+        first = self.column[network.target][:, None]
         self.columns = np.full(3 * len(network.target) + q * network.frames, -1)
         at = 3 * np.arange(len(network.target)) + q * network.frame
-        self.columns[at[:, None] + [0, 1, 2]] = of_sighting
+        self.columns[at[:, None] + [0, 1, 2]] = np.where(first >= 0, first + [0, 1, 2], -1)
         if q:
             at = 3 * network.start[1:] + q * np.arange(network.frames)
             self.columns[at[:, None] + np.arange(q)] = self.size - q + np.arange(q)
