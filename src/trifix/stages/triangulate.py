@@ -19,6 +19,6 @@ def triangulate(dots: StereoDots, matches: StereoMatches, rig: StereoRig, noise_
         xyz_mm=xyz,
         cov_mm2=cov,
         match=good,
-        label=np.maximum(dots.left.label[rows_left[good]], dots.right.label[rows_right[good]]),
+        label=integers(np.maximum(dots.left.label[rows_left[good]], dots.right.label[rows_right[good]])),
         row=np.arange(len(good)),
     )
