@@ -15,8 +15,9 @@ from nothing: no frame follows another in time. A run that was killed goes on; t
 - ghosts: points at random in the sensor's view. Any fix is wrong.
 
 A fix is wrong if it is off by more than 3 mm or 0.5 degrees and by more than 5 sigma from the pose that the frame's
-true labels give against the same map. For the curve of the threshold against right and wrong fixes, frames whose best
-candidate was not proven are judged a second time with the threshold at (almost) one, which tells its pose.
+true labels give against the same map; where these are too nearly on a line, if one of its pairs is false. For the curve
+of the threshold against right and wrong fixes, frames whose best candidate was not proven are judged a second time with
+the threshold at (almost) one: that tells its pose, or that it would be refused for another reason at any threshold.
 
 The power of the test: how often would the best candidate be wrong if residuals alone decided, with at least three
 points and at most 0.6 mm (rms)? This is asked of the program's own candidates, in all frames: a lower bound of what
@@ -115,7 +116,7 @@ def judged(task: shards.Task) -> dict[str, object]:
     world, batch = KINDS[task.kind](rng, task.frames)
     positioner = Positioner(task.config, map=world.map, is_map_frozen=True)
     open_config = replace(task.config, verify=replace(task.config.verify, max_p_chance=OPEN))
-    unbiased = Positioner(open_config, map=world.map, is_map_frozen=True)
+    lenient = Positioner(open_config, map=world.map, is_map_frozen=True)
     reasons, parts = Counter[str](), Counter[str]()
     right, wrong = np.zeros(DECADES, dtype=int), np.zeros(DECADES, dtype=int)
     fixes = {True: 0, False: 0}
@@ -146,19 +147,15 @@ def judged(task: shards.Task) -> dict[str, object]:
             case NoFix():
                 reasons[fix.why.name] += 1
                 matched, rms_mm = fix.matched, fix.residual_mm
-                pose, p_chance = None, fix.p_chance
-                if fix.rivals:
-                    pose = fix.rivals[0].T_world_sensor
-                elif fix.weak is not None:
-                    pose = fix.weak.T_world_sensor
-                elif fix.why is Reason.not_proven and batch.is_positionable(k, world.map):
-                    again = unbiased.step(frame).fix
-                    if isinstance(again, Fix):
-                        pose, p_chance = again.T_world_sensor, again.p_chance
-                is_right = pose is not None and batch.is_right(k, pose, world.map)
-                if fix.why is Reason.not_proven and np.isfinite(p_chance):
-                    (right if is_right else wrong)[decade(p_chance)] += 1
-        if matched >= RESIDUAL_POINTS and rms_mm <= RESIDUAL_MM:
+                loose = fix
+                has_pose = len(batch.labelled(k)) >= 3
+                if fix.why is Reason.not_proven and (has_pose or fix.p_chance <= 0.1):
+                    loose = lenient.step(frame).fix
+                is_right = is_candidate_right(batch, k, loose, world) if has_pose else False
+                is_fix_at_some_threshold = isinstance(loose, Fix) or loose.why is Reason.not_proven
+                if fix.why is Reason.not_proven and is_fix_at_some_threshold and is_right is not None:
+                    (right if is_right else wrong)[decade(loose.p_chance)] += 1
+        if is_right is not None and matched >= RESIDUAL_POINTS and rms_mm <= RESIDUAL_MM:
             by_residual[is_right] += 1
     return {
         "frames": len(batch),
@@ -182,6 +179,18 @@ def is_fix_right(batch: Batch, k: int, fix: Fix, world: World) -> bool:
     if not batch.is_positionable(k, world.map):
         return are_pairs_true
     return batch.is_right(k, fix.T_world_sensor, world.map)
+
+
+def is_candidate_right(batch: Batch, k: int, fix: Fix | NoFix, world: World) -> bool | None:
+    """The same of the best candidate of a frame; None where it does not tell its pose."""
+    match fix:
+        case Fix():
+            return is_fix_right(batch, k, fix, world)
+        case NoFix(weak=Fix() as weak):
+            return is_fix_right(batch, k, weak, world)
+        case NoFix(rivals=(best, *_)) if batch.is_positionable(k, world.map):
+            return batch.is_right(k, best.T_world_sensor, world.map)
+    return None
 
 
 def decade(p_chance: float) -> int:
