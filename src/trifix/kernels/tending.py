@@ -2,8 +2,8 @@
 
 What is remembered of a target stands in one row of each of four tables: ``count`` (integers, columns below),
 ``cells`` (two sets of directions: seen from, and missed from since it was last seen), ``first`` (unit direction of the
-first sighting, NaN where unknown) and ``bias`` (information of the residuals, upper triangle row by row, and their
-weighted sum). Millimetres, world coordinates.
+first sighting, NaN where unknown) and ``bias`` (information of the residuals, upper triangle row by row, their weighted
+sum, and the mean of the newest). Millimetres, world coordinates.
 """
 
 import numpy as np
@@ -19,6 +19,7 @@ WITNESSES = 3
 """Targets that stood there when another was last seen and still do: so many say where that one should be."""
 
 _TRUSTED = 1  # TargetState.trusted
+_NEWEST = 0.3  # share of the newest residual in their mean: that of the last three or so
 
 
 @njit(cache=True, nogil=True)
@@ -133,16 +134,16 @@ def _cell(x, y, z):
 def weigh(
     R, t, P, point_xyz, point_cov, point, target, at, at_cov, missed, xyz, cov, max_sigmas, forgetting, count, bias
 ):
-    """Adds residuals, point less target, to the targets' bias; returns χ² of three degrees, shift, size of error.
+    """Adds residuals, point less target, to the targets' bias; returns its χ² and the shift, in mm and in sigmas.
 
     First come the ``target`` of a fix, which stood ``at`` before it, then the ``missed``, for each of which the nearest
     point speaks that the fix left over. Residuals beyond ``max_sigmas`` are passed over, and leave zeros.
 
-    With b = Σ λⁱ S⁻¹ r and A = Σ λⁱ S⁻¹ the shift is A⁻¹ b, and, were there none, (1 + λ) bᵀ A⁻¹ b would be χ² of three
-    degrees once many have been weighed. The size of the error is the standard deviation of one residual, rms over axes.
+    With b = Σ λⁱ S⁻¹ r and A = Σ λⁱ S⁻¹, were there no bias, (1 + λ) bᵀ A⁻¹ b would be χ² of three degrees once many
+    have been weighed. The shift is the mean of the newest residuals, its sigmas those of the last.
     """
     n, m = len(point_xyz), len(target)
-    found = np.zeros((m + len(missed), 5))
+    found = np.zeros((m + len(missed), 3))
     world = np.empty((n, 3))
     is_free = np.ones(n, np.bool_)
     for p in range(n):
@@ -150,7 +151,7 @@ def weigh(
             world[p, a] = R[a, 0] * point_xyz[p, 0] + R[a, 1] * point_xyz[p, 1] + R[a, 2] * point_xyz[p, 2] + t[a]
     for p in point:
         is_free[p] = False
-    S, inverse, r = np.empty((3, 3)), np.empty(6), np.empty(3)
+    S, weight, inverse, r = np.empty((3, 3)), np.empty(6), np.empty(6), np.empty(3)
     for k in range(len(found)):
         if k < m:
             q, p, x, C = target[k], point[k], at[k], at_cov[k]
@@ -172,24 +173,25 @@ def weigh(
             r[a] = world[p, a] - x[a]
             for b in range(3):
                 S[a, b] += C[a, b]
-        if not _inverse(S[0, 0], S[0, 1], S[0, 2], S[1, 1], S[1, 2], S[2, 2], inverse):
+        if not _inverse(S[0, 0], S[0, 1], S[0, 2], S[1, 1], S[1, 2], S[2, 2], weight):
             continue
-        if _form(inverse, r) > max_sigmas**2:
+        if _form(weight, r) > max_sigmas**2:
             continue
         v = bias[q]
-        v *= forgetting
+        for a in range(9):
+            v[a] *= forgetting
         for a in range(6):
-            v[a] += inverse[a]
-        v[6] += inverse[0] * r[0] + inverse[1] * r[1] + inverse[2] * r[2]
-        v[7] += inverse[1] * r[0] + inverse[3] * r[1] + inverse[4] * r[2]
-        v[8] += inverse[2] * r[0] + inverse[4] * r[1] + inverse[5] * r[2]
+            v[a] += weight[a]
+        v[6] += weight[0] * r[0] + weight[1] * r[1] + weight[2] * r[2]
+        v[7] += weight[1] * r[0] + weight[3] * r[1] + weight[4] * r[2]
+        v[8] += weight[2] * r[0] + weight[4] * r[1] + weight[5] * r[2]
+        for a in range(3):
+            v[9 + a] += _NEWEST * (r[a] - v[9 + a])
         count[q, WEIGHED] += 1
         if _inverse(v[0], v[1], v[2], v[3], v[4], v[5], inverse):
             found[k, 0] = (1.0 + forgetting) * _form(inverse, v[6:])
-            found[k, 1] = inverse[0] * v[6] + inverse[1] * v[7] + inverse[2] * v[8]
-            found[k, 2] = inverse[1] * v[6] + inverse[3] * v[7] + inverse[4] * v[8]
-            found[k, 3] = inverse[2] * v[6] + inverse[4] * v[7] + inverse[5] * v[8]
-            found[k, 4] = np.sqrt((S[0, 0] + S[1, 1] + S[2, 2]) / 3.0)
+            found[k, 1] = np.sqrt(v[9] ** 2 + v[10] ** 2 + v[11] ** 2)
+            found[k, 2] = np.sqrt(_form(weight, v[9:]))
     return found
 
 
@@ -292,7 +294,7 @@ def warm_up() -> None:
     rows, xyz, cov = np.zeros(1, np.int64), np.ones((k, 3)), np.tile(np.eye(3), (k, 1, 1))
     id, state = np.zeros(k, np.int64), np.ones(k, np.int64)
     count, cells = np.zeros((k, COLUMNS), np.int64), np.zeros((k, 2, CELLS), np.uint64)
-    first, bias, t, R = np.zeros((k, 3)), np.zeros((k, 9)), np.zeros(3), np.eye(3)
+    first, bias, t, R = np.zeros((k, 3)), np.zeros((k, 12)), np.zeros(3), np.eye(3)
     witness(1, t, rows, rows, rows, 1.0, id, xyz, count, cells, first, bias)
     directions(cells)
     weigh(R, t, np.eye(6), xyz, cov, rows, rows, xyz[:1], cov[:1], rows, xyz, cov, 4.0, 0.9, count, bias)

@@ -29,7 +29,7 @@ class TendOptions:
     """Whether it is; false keeps everything, as in the paper."""
     min_turn_deg: float = 1.0
     """Directions to the sensor must differ by this for a target to be trusted (degrees)."""
-    max_p_still: float = 1e-15
+    max_p_still: float = 1e-12
     """A target is quarantined when its residuals would be so biased with this probability, had it not moved."""
     min_shift_sigmas: float = 1.5
     """Shifts below so many standard deviations of a single sighting are no move, however sure they are."""
@@ -116,7 +116,9 @@ _AGREEMENT = 1e-3  # probability below which a pose does not follow from the ear
 _MAX_STRAYS = 5  # frames in a row that may have been positioned falsely
 _MIN_TURNS = 2  # frames that must show one of two targets alone even where other pairs lie apart alike
 _ALIKE = 0.3  # share of their distance by which two pairs may lie apart differently
+_MEDIAN_CHI2 = 2.37  # of three degrees
 _EXACT_MM2 = 1e-12  # what a covariance of zero is taken for
+_AT_MOST = 3.0  # standard deviations that the farthest place stands for which can be reached at the pace that was
 _CROWD = 2  # witnesses to each target that has moved: where more go together, it is the map that drifted
 
 
@@ -139,7 +141,7 @@ class Care:
         self._count = np.zeros((0, kernels.COLUMNS), dtype=np.int64)
         self._cells = np.zeros((0, 2, kernels.CELLS), dtype=np.uint64)
         self._first = np.zeros((0, 3))
-        self._bias = np.zeros((0, 9))
+        self._bias = np.zeros((0, 12))
 
     def tend(
         self,
@@ -163,7 +165,6 @@ class Care:
         self._grow(len(map))
         seen, pose = fix.target, fix.T_world_sensor
         changed = map.misses != self._misses[: len(map)]
-        self._misses[: len(map)] = map.misses
         is_late, self._newest_frame = frame.index <= self._newest_frame, max(self._newest_frame, frame.index)
         missed = np.flatnonzero(changed & map.alive) if not is_late else np.zeros(0, dtype=np.int64)
         witnesses = kernels.witness(
@@ -183,6 +184,7 @@ class Care:
         row = np.concatenate([seen, added])
         self._journal.append(Lesson(frame.index, frame.timestamp_ns, fix, row, before, map.rows(row)))
         map = self._trusted_from_several_sides(before, map, seen)
+        self._misses[: len(map)] = map.misses
         if is_late:
             return map, []
         missed, witnesses = missed[witnesses >= 0], witnesses[witnesses >= 0]
@@ -193,7 +195,7 @@ class Care:
 
     def rescale(self, ratio: float) -> None:
         """Follows a change of the noise scale: all covariances are in proportion to its square."""
-        self._bias /= ratio**2
+        self._bias[:, :9] /= ratio**2
         self._journal = deque(
             (
                 replace(each, before=_rescaled(each.before, ratio), after=_rescaled(each.after, ratio))
@@ -251,25 +253,26 @@ class Care:
             self._count,
             self._bias,
         )
-        suspect = np.flatnonzero(found[:, 0] > self._max_bias)
-        if len(suspect) == 0:
+        if found[:, 0].max(initial=0.0) <= self._max_bias:
             return map, []
+        # where all residuals are larger than stated, each is judged against the others
+        chi2 = found[:, 0] / max(1.0, float(np.median(found[:, 0])) / _MEDIAN_CHI2)
         row = np.concatenate([fix.target, missed])
-        size = np.linalg.norm(found[:, 1:4], axis=1)
         is_sure = (
-            (self._count[row, WEIGHED] >= _MIN_WEIGHED)
+            (chi2 > self._max_bias)
+            & (self._count[row, WEIGHED] >= _MIN_WEIGHED)
             & (self._count[row, HITS] >= _MIN_HITS)
             & (map.state[row] == TargetState.trusted)
-            & (size > options.min_shift_sigmas * found[:, 4])
+            & (found[:, 2] > options.min_shift_sigmas)
         )
-        suspect = suspect[is_sure[suspect]]
-        biased = int((found[:, 0] > 0.5 * self._max_bias).sum())
+        suspect = np.flatnonzero(is_sure)
+        biased = int((chi2 > 0.5 * self._max_bias).sum())
         if len(suspect) == 0 or _CROWD * biased > len(fix.target) - biased:
             return map, []
         events: list[Event] = []
         for k in suspect.tolist():
             target = int(map.id[row[k]])
-            detail = f"by about {size[k]:.2f} mm (χ² {found[k, 0]:.0f} of its residuals)"
+            detail = f"by about {found[k, 1]:.2f} mm (χ² {chi2[k]:.0f} of its residuals)"
             events.append(Event("target_moved", target, detail))
             events.append(Event("target_quarantined", target, "its residuals are biased"))
         return _in_state(map, row[suspect], TargetState.quarantined), events
@@ -295,15 +298,15 @@ class Care:
         )
         for a, b in together:
             self._turns[_pair(map, a, b)] = -1
-        is_alive = map.alive[missed]
-        missed, witnesses = missed[is_alive], witnesses[is_alive]
+        is_trusted = map.state[missed] == TargetState.trusted  # others that are missed may never have been
+        missed, witnesses = missed[is_trusted], witnesses[is_trusted]
         if len(missed) == 0:
             return map, []
         apart_mm = options.min_apart * self._apart_mm if np.isfinite(self._apart_mm) else 0.0
         near = kernels.near_pairs(missed, apart_mm, seen, options.explained_sigmas, *place)
         misses = np.where(witnesses >= kernels.WITNESSES, count[missed, MISSED], 0)
         due = misses * (count[missed, HITS] + 1.0) / (count[missed, TRIES] + 2.0)
-        is_missing = (map.state[missed] == TargetState.trusted) & (due >= 0.5 * options.removed_after)
+        is_missing = due >= 0.5 * options.removed_after
         if not near and not is_missing.any():
             return map, []
         map, events = map.copy(), list[Event]()
@@ -315,8 +318,9 @@ class Care:
             has_moved = came_since & (_CROWD * np.unique(pairs[came_since, 0]).size <= witnesses[k])
             events += self._merge(map, pairs[~has_moved])
             is_due = has_moved & (misses[k] >= options.moved_after)
-            for a, b in pairs[is_due & (map.state[pairs] == TargetState.trusted).all(axis=1)].tolist():
-                if map.state[a] == TargetState.trusted and int(map.id[b]) not in self._arrived:
+            for a, b in pairs[is_due].tolist():
+                both_trusted = map.state[a] == map.state[b] == TargetState.trusted
+                if both_trusted and int(map.id[b]) not in self._arrived:
                     events += self._move(map, a, b)
         is_missing &= map.state[missed] == TargetState.trusted
         is_missing[is_missing] = kernels.directions(self._cells[missed[is_missing]]) >= options.removed_directions
@@ -382,22 +386,23 @@ class Care:
             if not map.alive[[a, b]].all():
                 continue
             del self._turns[keys[j]]
-            stays, goes = sorted((a, b), key=lambda row: (count[row, FIRST], map.id[row]))
+            stays, goes = sorted((a, b), key=lambda row: int(map.id[row]))
             detail = f"into target {map.id[stays]}, {d_mm[j]:.2f} mm away"
             events.append(Event("target_merged", int(map.id[goes]), detail))
-            _unite(map, stays, goes)
+            _unite(map, stays, goes, self._options.explained_sigmas)
             self._cells[stays, 0] |= self._cells[goes, 0]
             self._cells[stays, 1] = 0
             count[stays, [HITS, TRIES]] += count[goes, [HITS, TRIES]]
+            count[stays, FIRST] = count[[a, b], FIRST].max()  # it is no witness of what was before
             count[stays, LAST], count[stays, MISSED], count[stays, WEIGHED] = self._lessons, 0, 0
             self._bias[stays] = 0.0
         return events
 
     def _undo_strays(self, map: ReferenceMap, hand: Hand) -> tuple[ReferenceMap, list[Event]]:
         """The map without what the frames taught that were positioned where no hand can have been."""
-        found = strays(self._journal, hand, self._options.max_p_hand)
+        found, chi2 = strays(self._journal, hand, self._options.max_p_hand)
         events = []
-        for lesson, chi2 in found:
+        for lesson in found:
             self._journal.remove(lesson)
             map = without(map, lesson)
             detail = f"frame {lesson.frame}: no hand moves there and back between the frames around it (χ² {chi2:.0f})"
@@ -405,40 +410,42 @@ class Care:
         return map, events
 
 
-def strays(journal: Sequence[Lesson], hand: Hand, max_p: float) -> list[tuple[Lesson, float]]:
-    """Lessons before the newest from poses that the poses around them, agreeing with one another, rule out; their χ².
+def strays(journal: Sequence[Lesson], hand: Hand, max_p: float) -> tuple[list[Lesson], float]:
+    """Lessons before the newest from poses that those around them, agreeing with one another, rule out; and the χ².
 
-    The newest pose must follow from the two before the strays at an even pace; the strays must lie off the way between,
-    farther than a hand is carried by its accelerations or by turning round at the pace that it had.
+    The newest pose must follow from the two before the strays at an even pace. The strays must lie off the way between,
+    and the leaps out and back be farther than accelerations or turning round carry a hand, each with the root of
+    ``max_p``.
     """
     from scipy.special import chdtri
 
     if len(journal) < 4 or not _leaps(journal, hand):
-        return []
-    agreement, limit = float(chdtri(6, _AGREEMENT)), float(chdtri(6, max_p))
+        return [], 0.0
+    agreement, limit = float(chdtri(6, _AGREEMENT)), float(chdtri(6, np.sqrt(max_p)))
     newest = journal[-1]
     for run in range(1, min(_MAX_STRAYS, len(journal) - 3) + 1):
         before, last, between = journal[-run - 3], journal[-run - 2], [journal[k] for k in range(-run - 1, -1)]
-        way, gap_s, step_s = last.pose.inverse() @ newest.pose, newest.since(last), last.since(before)
+        gap_s, step_s = newest.since(last), last.since(before)
         if not (0 < gap_s <= hand.max_gap_s and 0 < step_s <= hand.max_gap_s):
-            return []
+            break
         pace = (before.pose.inverse() @ last.pose).log() / step_s
-        steady = Pose.exp(pace * gap_s)
-        spread = newest.fix.cov + last.fix.cov
-        if _misfit(steady, way, spread + before.fix.cov, hand.reach(0.5 * gap_s * (gap_s + step_s))) > agreement:
+        if _misfit(last, newest, pace, hand.reach(0.5 * gap_s * (gap_s + step_s))) > agreement:
             continue
-        found = []
+        way = (last.pose.inverse() @ newest.pose).log() / gap_s
+        turned = np.repeat([np.linalg.norm(pace[:3]), np.linalg.norm(pace[3:])], 3) / _AT_MOST
+        off = []
         for each in between:
             s = each.since(last)
-            there, turned_s = Pose.exp(way.log() * (s / gap_s)), min(s, gap_s - s)
-            turned = np.repeat([np.linalg.norm(pace[:3]), np.linalg.norm(pace[3:])], 3) * turned_s
-            sigma = np.hypot(hand.reach(0.5 * s * (gap_s - s)), turned)
-            chi2 = _misfit(there, last.pose.inverse() @ each.pose, spread + each.fix.cov, sigma)
-            if chi2 > limit:
-                found.append((each, chi2))
-        if len(found) == run:
-            return found
-    return []
+            sigma = np.hypot(hand.reach(0.5 * s * (gap_s - s)), turned * min(s, gap_s - s))
+            off.append(_misfit(last, each, way, sigma))
+        out_s, back_s = between[0].since(last), newest.since(between[-1])
+        out = _misfit(last, between[0], pace, np.hypot(hand.reach(0.5 * out_s * (out_s + step_s)), turned * out_s))
+        back = _misfit(
+            newest, between[-1], way, np.hypot(hand.reach(0.5 * back_s * (back_s + step_s)), turned * back_s)
+        )
+        if min(off) > agreement and min(out, back) > limit:
+            return between, min(out, back)
+    return [], 0.0
 
 
 def _leaps(journal: Sequence[Lesson], hand: Hand) -> bool:
@@ -456,10 +463,11 @@ def _leaps(journal: Sequence[Lesson], hand: Hand) -> bool:
     )
 
 
-def _misfit(expected: Pose, found: Pose, cov: Float[np.ndarray, "6 6"], sigma: Float[np.ndarray, "6"]) -> float:
-    """χ² of six degrees of a motion, had it been another one but for the poses' covariance and a hand's freedom."""
-    delta = (expected.inverse() @ found).log()
-    return float(delta @ np.linalg.solve(cov + np.diag(sigma**2), delta))
+def _misfit(one: Lesson, other: Lesson, pace: Float[np.ndarray, "6"], sigma: Float[np.ndarray, "6"]) -> float:
+    """χ² of six degrees of the other pose, had the sensor gone there at a pace, give or take its freedom."""
+    there = one.pose @ Pose.exp(pace * other.since(one))
+    delta = (there.inverse() @ other.pose).log()
+    return float(delta @ np.linalg.solve(one.fix.cov + other.fix.cov + np.diag(sigma**2), delta))
 
 
 def without(map: ReferenceMap, lesson: Lesson) -> ReferenceMap:
@@ -500,20 +508,20 @@ def _information(map: ReferenceMap, row: int) -> tuple[Float[np.ndarray, "3 3"],
     return A, A @ map.xyz_mm[row]
 
 
-def _unite(map: ReferenceMap, stays: int, goes: int) -> None:
-    """Puts two rows of a map into the first: positions by covariance, and as unsure as the two lie apart."""
+def _unite(map: ReferenceMap, stays: int, goes: int, explained_sigmas: float) -> None:
+    """Puts two rows of a map into the first, by covariance, which grows where it does not explain how they lie."""
     pair = [stays, goes]
     C, x, n = map.cov_mm2[pair], map.xyz_mm[pair], map.sightings[pair]
     total = C[0] + C[1] + _EXACT_MM2 * np.eye(3)
-    K = C[0] @ np.linalg.inv(total)
-    r = x[1] - x[0]
-    excess = max(0.0, float(r @ np.linalg.solve(total, r)) / 9.0 - 1.0)
-    cov = (C[0] - K @ C[0]) * (1.0 + excess)
+    K, r = C[0] @ np.linalg.inv(total), x[1] - x[0]
+    cov = C[0] - K @ C[0]
+    if r @ np.linalg.solve(total, r) > explained_sigmas**2:  # anywhere between: half their distance is 1 sigma
+        cov = cov + (r @ r) / 4.0 * np.eye(3)
     map.xyz_mm[stays], map.cov_mm2[stays] = x[0] + K @ r, 0.5 * (cov + cov.T)
     view = np.nan_to_num(map.view[pair]).T @ np.maximum(n, 1)
     map.view[stays] = view / max(float(np.linalg.norm(view)), 1e-12)
     map.sightings[stays], map.last_seen[stays] = n.sum(), map.last_seen[pair].max()
-    map.state[stays], map.misses[stays] = map.state[pair].max(), map.misses[pair].min()
+    map.state[stays] = map.state[pair].max()
     map.state[goes] = TargetState.removed
 
 
