@@ -23,7 +23,7 @@ _NEWEST = 0.3  # share of the newest residual in their mean: that of the last th
 
 
 @njit(cache=True, nogil=True)
-def witness(lesson, t, seen, missed, added, min_turn_cos, id, xyz, count, cells, first, bias):
+def witness(lesson, t, seen, missed, added, min_turn_cos, id, xyz, state, count, cells, first, bias):
     """Counts sightings and misses; returns how many witnesses each miss has (n), -1 for one that tells nothing.
 
     A miss tells nothing unless the target was seen from about the same direction before. It counts only if three of
@@ -43,7 +43,7 @@ def witness(lesson, t, seen, missed, added, min_turn_cos, id, xyz, count, cells,
         for other in seen:
             if count[other, ID] == id[other] and count[other, FIRST] <= count[row, LAST]:
                 witnesses[k] += 1
-        if witnesses[k] >= WITNESSES and _stands_free(k, seen, missed, xyz):
+        if witnesses[k] >= WITNESSES and _stands_free(k, seen, missed, xyz, state):
             count[row, MISSED] += 1
             cells[row, 1, word] |= bit
     for row in seen:
@@ -57,14 +57,14 @@ def witness(lesson, t, seen, missed, added, min_turn_cos, id, xyz, count, cells,
 
 
 @njit(cache=True, nogil=True)
-def _stands_free(k, seen, missed, xyz):
-    """Whether two of the three nearest to a missed target are seen."""
+def _stands_free(k, seen, missed, xyz, state):
+    """Whether two of the three nearest to a missed target are seen; others that were missed may never have been."""
     d2 = np.full(3, np.inf)
     is_seen = np.zeros(3, np.bool_)
     for i in range(len(seen) + len(missed)):
-        if i == len(seen) + k:
-            continue
         row = seen[i] if i < len(seen) else missed[i - len(seen)]
+        if i == len(seen) + k or (i >= len(seen) and state[row] != _TRUSTED):
+            continue
         d = _distance2(xyz[row], xyz[missed[k]])
         for place in range(3):
             if d < d2[place]:
@@ -295,7 +295,7 @@ def warm_up() -> None:
     id, state = np.zeros(k, np.int64), np.ones(k, np.int64)
     count, cells = np.zeros((k, COLUMNS), np.int64), np.zeros((k, 2, CELLS), np.uint64)
     first, bias, t, R = np.zeros((k, 3)), np.zeros((k, 12)), np.zeros(3), np.eye(3)
-    witness(1, t, rows, rows, rows, 1.0, id, xyz, count, cells, first, bias)
+    witness(1, t, rows, rows, rows, 1.0, id, xyz, state, count, cells, first, bias)
     directions(cells)
     weigh(R, t, np.eye(6), xyz, cov, rows, rows, xyz[:1], cov[:1], rows, xyz, cov, 4.0, 0.9, count, bias)
     seen_together(rows, 1.0, 0.4, 4.0, xyz, cov, state)

@@ -176,6 +176,7 @@ class Care:
             self._min_turn_cos,
             map.id,
             map.xyz_mm,
+            map.state,
             self._count,
             self._cells,
             self._first,
