@@ -2,7 +2,7 @@
 
 Run: python benchmarks/cold_start.py --out out/cold_start --queries 1000
 
-Frames of 8 to 25 points, a quarter of them strays; one frame in five shows a foreign object. Everybody gets the same
+Frames of 10 to 25 points, a quarter of them strays; one frame in five shows a foreign object. Everybody gets the same
 frames in turn, on one core, in one run; what a map needs beforehand is done once and not counted. Who has used up its
 time with a map gets no more of its queries, and who could not finish one with it is left out. An answer of the others
 counts when at least 40 % of the frame's points, and five, agree with it; trifix decides by itself.
@@ -47,7 +47,7 @@ from trifix.records import Frame, ReferenceMap, SensorPoints
 SIZES = (50, 118, 1000, 10_000, 100_000, 1_000_000)
 SPACING_MM = 35.0
 FOREIGN, STRAYS = 0.2, 0.25
-LEAST, LARGEST = 8, 25
+LEAST, LARGEST = 10, 25
 TOLERANCE_MM = 0.3
 """Distances of a frame and of the map agree within this much: four sigma."""
 REACH_MM = 1.0
