@@ -26,6 +26,7 @@ from trifix.stages.identify import IdentifyOptions
 from trifix.stages.identify.congruence import Technique
 from trifix.stages.match import MatchOptions
 from trifix.stages.predict import PredictOptions
+from trifix.stages.tend import TendOptions
 from trifix.stages.update import UpdateOptions
 from trifix.stages.verify import VerifyOptions
 from trifix.stages.weigh import NoiseOptions
@@ -73,6 +74,8 @@ class Config:
     """When a pose is believed."""
     update: UpdateOptions = field(default_factory=UpdateOptions)
     """How the map grows."""
+    tend: TendOptions = field(default_factory=TendOptions)
+    """How the map is kept clean."""
     islands: IslandOptions = field(default_factory=IslandOptions)
     """What becomes of frames that nothing connects to the map."""
 
@@ -109,6 +112,7 @@ def paper_options(technique: Technique = "frequency") -> Config:
         ),
         verify=VerifyOptions(method="residual", max_residual_mm=0.5),
         update=UpdateOptions(method="kalman", max_misses=0),
+        tend=TendOptions(tends=False),
         islands=IslandOptions(max_islands=0),
     )
 

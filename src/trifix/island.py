@@ -18,6 +18,7 @@ from trifix.config import Config
 from trifix.geometry.alignment import point_jacobian
 from trifix.geometry.pose import Pose
 from trifix.records import (
+    Event,
     Fix,
     Frame,
     Identification,
@@ -33,6 +34,7 @@ from trifix.records import (
 from trifix.stages.identify import AllTriangles, identifier
 from trifix.stages.orient import orient
 from trifix.stages.predict import Motion, follow, predict
+from trifix.stages.tend import Care, Hand
 from trifix.stages.update import found_map, update
 from trifix.stages.verify import verify
 from trifix.stages.verify_residual import verify_residual
@@ -52,6 +54,11 @@ class Island:
         self.is_absorbed = False
         self.removed = NOTHING
         """Identities of the targets that the last lesson took out of the map."""
+        self.events: list[Event] = []
+        """What tending the map found after the last lesson."""
+        self._care = Care(config.tend)
+        move = config.predict
+        self._hand = Hand(move.acceleration_mm_s2, move.angular_acceleration_rad_s2, move.max_gap_s)
         self._gauge = np.zeros((6, 6))
         self._all_triangles = AllTriangles(config.identify)
         self._widened_for: ReferenceMap | None = None
@@ -114,6 +121,7 @@ class Island:
         """A fix to a better map; returns the rows of the targets that are new."""
         self.frames += 1
         self.removed = NOTHING
+        self.events = []
         self.follow(frame.timestamp_ns, fix)
         if self._is_frozen:
             self.identifier.learn(self.map, fix.target)
@@ -128,6 +136,8 @@ class Island:
             )
             gone = np.flatnonzero(before.alive)
             self.removed = before.id[gone[before.id[gone] != np.where(self.map.alive, self.map.id, -1)[gone]]]
+            known = before.rows(fix.target)
+            self.map, self.events = self._care.tend(known, self.map, added, points, fix, frame, self._hand)
         self.identifier.learn(self.map, np.unique(np.concatenate([fix.target, added])))
         return added
 
@@ -147,6 +157,7 @@ class Island:
     def rescale(self, ratio: float) -> None:
         """Follows a change of the noise scale: all covariances are in proportion to its square."""
         self._gauge = self._gauge * ratio**2
+        self._care.rescale(ratio)
         self.map = replace(self.map, cov_mm2=self.map.cov_mm2 * ratio**2)
 
     def follow(self, timestamp_ns: int, fix: Fix) -> None:

@@ -117,6 +117,7 @@ class Positioner:
             if there is not None and island is not None:
                 added = self._learn(frame, points, matches, island, there, clock)
                 events += [Event("target_removed", int(each), "not seen again") for each in island.removed]
+                events += island.events
             elif self._may_found(points, fix):
                 island, there = self._found_island(frame, points)
                 events.append(Event("island_founded", None, f"island {island.number}, {len(points)} targets"))

@@ -165,6 +165,7 @@ class Care:
         self._grow(len(map))
         seen, pose = fix.target, fix.T_world_sensor
         changed = map.misses != self._misses[: len(map)]
+        changed[fix.single.target] = False  # one camera saw them
         is_late, self._newest_frame = frame.index <= self._newest_frame, max(self._newest_frame, frame.index)
         missed = np.flatnonzero(changed & map.alive) if not is_late else np.zeros(0, dtype=np.int64)
         witnesses = kernels.witness(
