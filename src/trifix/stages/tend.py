@@ -108,6 +108,8 @@ class Hand:
         return time_s2 * np.repeat([self.acceleration_mm_s2, self.angular_acceleration_rad_s2], 3)
 
 
+_PROVISIONAL, _TRUSTED = int(TargetState.provisional), int(TargetState.trusted)  # an enum's own names are slow
+_QUARANTINED, _REMOVED = int(TargetState.quarantined), int(TargetState.removed)
 _FORGETTING = 0.9  # λ: a bias is that of the last ten sightings
 _MIN_WEIGHED = 5  # residuals before a bias is believed
 _MIN_HITS = 10  # sightings before that: a place that was never well known cannot have been left
@@ -167,7 +169,8 @@ class Care:
         changed = map.misses != self._misses[: len(map)]
         changed[fix.single.target] = False  # one camera saw them
         is_late, self._newest_frame = frame.index <= self._newest_frame, max(self._newest_frame, frame.index)
-        missed = np.flatnonzero(changed & map.alive) if not is_late else np.zeros(0, dtype=np.int64)
+        missed = np.flatnonzero(changed) if not is_late else np.zeros(0, dtype=np.int64)
+        missed = missed[map.state[missed] <= _TRUSTED]
         witnesses = kernels.witness(
             self._lessons,
             floats(pose.t_mm),
@@ -221,11 +224,11 @@ class Care:
         self, before: ReferenceMap, map: ReferenceMap, seen: Int[np.ndarray, "c"]
     ) -> ReferenceMap:
         """The map without trust in targets that were seen often, but always from the same direction."""
-        was_provisional = before.state == TargetState.provisional
+        was_provisional = before.state == _PROVISIONAL
         if not was_provisional.any():
             return map
-        rows = seen[was_provisional & (map.state[seen] == TargetState.trusted) & (self._count[seen, TURNED] == 0)]
-        return _in_state(map, rows, TargetState.provisional) if len(rows) else map
+        rows = seen[was_provisional & (map.state[seen] == _TRUSTED) & (self._count[seen, TURNED] == 0)]
+        return _in_state(map, rows, _PROVISIONAL) if len(rows) else map
 
     def _find_biased(
         self,
@@ -264,7 +267,7 @@ class Care:
             (chi2 > self._max_bias)
             & (self._count[row, WEIGHED] >= _MIN_WEIGHED)
             & (self._count[row, HITS] >= _MIN_HITS)
-            & (map.state[row] == TargetState.trusted)
+            & (map.state[row] == _TRUSTED)
             & (found[:, 2] > options.min_shift_sigmas)
         )
         suspect = np.flatnonzero(is_sure)
@@ -277,7 +280,7 @@ class Care:
             detail = f"by about {found[k, 1]:.2f} mm (χ² {chi2[k]:.0f} of its residuals)"
             events.append(Event("target_moved", target, detail))
             events.append(Event("target_quarantined", target, "its residuals are biased"))
-        return _in_state(map, row[suspect], TargetState.quarantined), events
+        return _in_state(map, row[suspect], _QUARANTINED), events
 
     def _compare(
         self,
@@ -293,14 +296,14 @@ class Care:
         has moved to where the nearest one came since, or is gone.
         """
         options, count = self._options, self._count
-        seen = integers(seen[map.state[seen] <= TargetState.trusted])
+        seen = integers(seen[map.state[seen] <= _TRUSTED])
         place = (map.xyz_mm, map.cov_mm2)
         self._apart_mm, together = kernels.seen_together(
             seen, self._apart_mm, options.min_apart, options.explained_sigmas, *place, map.state
         )
         for a, b in together:
             self._turns[_pair(map, a, b)] = -1
-        is_trusted = map.state[missed] == TargetState.trusted  # others that are missed may never have been
+        is_trusted = map.state[missed] == _TRUSTED  # others that are missed may never have been
         missed, witnesses = missed[is_trusted], witnesses[is_trusted]
         if len(missed) == 0:
             return map, []
@@ -321,10 +324,10 @@ class Care:
             events += self._merge(map, pairs[~has_moved])
             is_due = has_moved & (misses[k] >= options.moved_after)
             for a, b in pairs[is_due].tolist():
-                both_trusted = map.state[a] == map.state[b] == TargetState.trusted
+                both_trusted = map.state[a] == map.state[b] == _TRUSTED
                 if both_trusted and int(map.id[b]) not in self._arrived:
                     events += self._move(map, a, b)
-        is_missing &= map.state[missed] == TargetState.trusted
+        is_missing &= map.state[missed] == _TRUSTED
         is_missing[is_missing] = kernels.directions(self._cells[missed[is_missing]]) >= options.removed_directions
         for k in np.flatnonzero(is_missing).tolist():
             a = int(missed[k])
@@ -332,7 +335,7 @@ class Care:
             if b is not None:
                 events += self._move(map, a, b)
             elif due[k] >= options.removed_after:
-                map.state[a] = TargetState.removed
+                map.state[a] = _REMOVED
                 detail = f"missed in {misses[k]} frames that should have seen it, after frame {map.last_seen[a]}"
                 events.append(Event("target_removed", int(map.id[a]), detail))
         return map, events
@@ -347,7 +350,7 @@ class Care:
     def _successor(self, map: ReferenceMap, row: int) -> int | None:
         """The row of the target that a missing one has become: of those that came since, each the other's nearest."""
         count = self._count[: len(map)]
-        is_known = (map.state == TargetState.trusted) & (count[:, ID] == map.id)
+        is_known = (map.state == _TRUSTED) & (count[:, ID] == map.id)
         came = np.flatnonzero(is_known & (count[:, FIRST] > count[row, LAST]))
         came = came[[int(each) not in self._arrived for each in map.id[came]]]
         d_mm = np.linalg.norm(map.xyz_mm[came] - map.xyz_mm[row], axis=1)
@@ -360,7 +363,7 @@ class Care:
 
     def _move(self, map: ReferenceMap, a: int, b: int) -> list[Event]:
         """Puts aside the target that has become another."""
-        map.state[a] = TargetState.quarantined
+        map.state[a] = _QUARANTINED
         self._arrived.add(int(map.id[b]))
         moved_mm = float(np.linalg.norm(map.xyz_mm[b] - map.xyz_mm[a]))
         detail = f"by {moved_mm:.2f} mm, after frame {map.last_seen[a]}; it is target {map.id[b]} now"
@@ -477,11 +480,11 @@ def without(map: ReferenceMap, lesson: Lesson) -> ReferenceMap:
     map = map.copy()
     known = len(lesson.before)
     for k, row in enumerate(lesson.row.tolist()):
-        if map.id[row] != lesson.after.id[k] or map.state[row] == TargetState.removed:
+        if map.id[row] != lesson.after.id[k] or map.state[row] == _REMOVED:
             continue
         map.sightings[row] -= 1
         if map.sightings[row] <= 0:
-            map.state[row] = TargetState.removed
+            map.state[row] = _REMOVED
             continue
         if (
             k < known
@@ -524,7 +527,7 @@ def _unite(map: ReferenceMap, stays: int, goes: int, explained_sigmas: float) ->
     map.view[stays] = view / max(float(np.linalg.norm(view)), 1e-12)
     map.sightings[stays], map.last_seen[stays] = n.sum(), map.last_seen[pair].max()
     map.state[stays] = map.state[pair].max()
-    map.state[goes] = TargetState.removed
+    map.state[goes] = _REMOVED
 
 
 def _pair(map: ReferenceMap, a: int, b: int) -> tuple[int, int]:
@@ -537,7 +540,7 @@ def _rescaled(map: ReferenceMap, ratio: float) -> ReferenceMap:
     return replace(map, cov_mm2=map.cov_mm2 * ratio**2)
 
 
-def _in_state(map: ReferenceMap, rows: Int[np.ndarray, "r"], state: TargetState) -> ReferenceMap:
+def _in_state(map: ReferenceMap, rows: Int[np.ndarray, "r"], state: int) -> ReferenceMap:
     states = map.state.copy()
     states[rows] = state
     return replace(map, state=states)
