@@ -138,6 +138,7 @@ class Care:
         self._apart_mm = np.inf
         self._turns: dict[tuple[int, int], int] = {}
         self._arrived: set[int] = set()
+        self._strayed = np.zeros(0, dtype=np.int64)
         self._journal: deque[Lesson] = deque(maxlen=options.remembered)
         self._misses = np.zeros(0, dtype=np.int64)
         self._count = np.zeros((0, kernels.COLUMNS), dtype=np.int64)
@@ -194,9 +195,10 @@ class Care:
             return map, []
         missed, witnesses = missed[witnesses >= 0], witnesses[witnesses >= 0]
         map, biased = self._find_biased(before, map, points, fix, missed[witnesses >= kernels.WITNESSES])
+        found_again = self._find_again(map, seen) if len(self._strayed) else []
         map, gone = self._compare(map, seen, missed, witnesses)
         map, undone = self._undo_strays(map, hand)
-        return map, [*biased, *gone, *undone]
+        return map, [*biased, *found_again, *gone, *undone]
 
     def rescale(self, ratio: float) -> None:
         """Follows a change of the noise scale: all covariances are in proportion to its square."""
@@ -238,7 +240,10 @@ class Care:
         fix: Fix,
         missed: Int[np.ndarray, "m"],
     ) -> tuple[ReferenceMap, list[Event]]:
-        """Targets whose residuals over several frames all point the same way have moved, if few of the others did."""
+        """Puts aside targets whose residuals over several frames all point the same way, if those of others do not.
+
+        It may have moved, or never have been one place: a false pair of dots slides as the sensor goes on.
+        """
         options, T = self._options, fix.T_world_sensor
         found = kernels.weigh(
             floats(T.R),
@@ -277,10 +282,23 @@ class Care:
         events: list[Event] = []
         for k in suspect.tolist():
             target = int(map.id[row[k]])
-            detail = f"by about {found[k, 1]:.2f} mm (χ² {chi2[k]:.0f} of its residuals)"
-            events.append(Event("target_moved", target, detail))
-            events.append(Event("target_quarantined", target, "its residuals are biased"))
+            detail = f"its residuals are biased by about {found[k, 1]:.2f} mm (χ² {chi2[k]:.0f})"
+            events.append(Event("target_quarantined", target, detail))
+        self._strayed = np.concatenate([self._strayed, row[suspect]])
         return _in_state(map, row[suspect], _QUARANTINED), events
+
+    def _find_again(self, map: ReferenceMap, seen: Int[np.ndarray, "c"]) -> list[Event]:
+        """Tells which of the targets put aside have moved: one that came since, and stays, is seen beside their place."""
+        count = self._count
+        new = integers(seen[(map.state[seen] == _TRUSTED) & (count[seen, HITS] >= _MIN_HITS)])
+        apart_mm = self._options.min_apart * self._apart_mm if np.isfinite(self._apart_mm) else 0.0
+        events: list[Event] = []
+        for a, b in kernels.near_pairs(self._strayed, apart_mm, new, 0.0, map.xyz_mm, map.cov_mm2):
+            is_told = a not in self._strayed or int(map.id[b]) in self._arrived
+            if not is_told and count[b, FIRST] > count[a, LAST]:
+                self._strayed = self._strayed[self._strayed != a]
+                events.append(self._moved(map, a, b))
+        return events
 
     def _compare(
         self,
@@ -364,11 +382,14 @@ class Care:
     def _move(self, map: ReferenceMap, a: int, b: int) -> list[Event]:
         """Puts aside the target that has become another."""
         map.state[a] = _QUARANTINED
+        return [self._moved(map, a, b), Event("target_quarantined", int(map.id[a]), "it has moved")]
+
+    def _moved(self, map: ReferenceMap, a: int, b: int) -> Event:
+        """Tells of a move; no target can be where two have gone."""
         self._arrived.add(int(map.id[b]))
         moved_mm = float(np.linalg.norm(map.xyz_mm[b] - map.xyz_mm[a]))
         detail = f"by {moved_mm:.2f} mm, after frame {map.last_seen[a]}; it is target {map.id[b]} now"
-        target = int(map.id[a])
-        return [Event("target_moved", target, detail), Event("target_quarantined", target, "it has moved")]
+        return Event("target_moved", int(map.id[a]), detail)
 
     def _merge(self, map: ReferenceMap, pairs: Int[np.ndarray, "m 2"]) -> list[Event]:
         """Makes one of two targets of which often enough one was seen and not the other; the older one stays.
