@@ -262,7 +262,7 @@ def test_an_empty_image_has_no_dots(shape: tuple[int, ...], dtype: type) -> None
 
 def test_nothing_is_compiled_after_the_warm_up(scene: Scene) -> None:
     detection.warm_up()
-    kernels = (detection.blobs, detection.fit_ellipses)
+    kernels = (detection.blobs, detection.fit_ellipses, detection.share_gradients, detection.distinct)
     before = [len(kernel.signatures) for kernel in kernels]
     image = expose(scene, 180, 30, 2, np.random.default_rng(0))
     for variant in (image, image[::2, ::2], image.astype(np.uint16), np.repeat(image[:, :, None], 3, axis=2)):

@@ -11,10 +11,11 @@ from numba import njit
 
 Grey = UInt8[np.ndarray, "h w"] | UInt16[np.ndarray, "h w"]
 
-# Columns of a blob: centre (px) and second moments (px²), sign: +1 of bright ones, -1 of dark ones.
+# Columns of a blob: centre (px) and second moments (px²), sign: +1 of bright ones, -1 of dark ones,
+# blur of the edge (px) to start with.
 # Columns of a fit: those, with the moments of the ellipse; covariance of the centre (px²), semi-axes (px) and the long
-# one's angle (rad), blur of the edge (px), grey values of the surround and of the step from it to the dot, rms residual.
-# NaN where there is no fit.
+# one's angle (rad), grey values of the surround and of the step from it to the dot, rms residual, what aliasing adds
+# to the covariance (px²). NaN where there is no fit.
 U, V, UU, UV, VV, SIGN, BLUR, COV_UU, COV_UV, COV_VV, A, B, THETA, AROUND, STEP, RESIDUAL, ALIASING = range(17)
 COLUMNS = 17
 
@@ -33,6 +34,7 @@ _BLUR_PX = 0.8
 _MIN_BLUR_PX = 0.29  # the pixel's own aperture: 1/sqrt(12)
 _QUANTISATION_VARIANCE = 1.0 / 12.0
 _ALIASING_PX2 = 0.013**2
+_MAX_START = 0.4
 _ENOUGH = 160  # pixels for the first, rough fit
 
 
@@ -75,8 +77,8 @@ def blobs(
     min_range: float,
     min_diameter_px: float,
     max_diameter_px: float,
+    min_length_px: float,
     min_axis_ratio: float,
-    min_fill: float,
 ) -> Float[np.ndarray, "m 7"]:
     """Roughly elliptic blobs, bright ones and dark ones, away from the border.
 
@@ -106,9 +108,9 @@ def blobs(
         if i * BLOCK_PX == v and i < rows:
             pieces, latest = 0, 0
             for j in range(columns):
-                least, most = float(darkest[i, j]), float(brightest[i, j])
+                faintest, most = float(darkest[i, j]), float(brightest[i, j])
                 s, t = 0, int(darkest[i, j]) + int(brightest[i, j])
-                if most - least > max(min_contrast * most, min_range):
+                if most - faintest > max(min_contrast * most, min_range):
                     s = 2
                     if i < rows - 1 and j < columns - 1:
                         if 2 * int(low[i, j]) > t:
@@ -200,7 +202,10 @@ def blobs(
         spread = sqrt(0.25 * (uu - vv) ** 2 + uv * uv)
         minor, major = 0.5 * (uu + vv) - spread, 0.5 * (uu + vv) + spread
         fill = area / (4 * pi * sqrt(det))
-        if minor < min_axis_ratio * min_axis_ratio * major or fill < min_fill:
+        # What pixels take away from an ellipse shrinks with their number.
+        if minor < min_axis_ratio * min_axis_ratio * major or fill < max(0.74, 0.94 - 0.9 / sqrt(area)):
+            continue
+        if 4 * sqrt(major) < min_length_px - 0.7:
             continue
         out[found, U], out[found, V], out[found, SIGN] = u_mean, v_mean, sign[k]
         out[found, BLUR] = _BLUR_PX
@@ -308,7 +313,7 @@ def _thin(pixels: np.ndarray, n: int) -> int:
     stride |= 1
     kept = 0
     for i in range(0, n, stride):
-        pixels[:, kept] = pixels[:, i]
+        pixels[0, kept], pixels[1, kept], pixels[2, kept] = pixels[0, i], pixels[1, i], pixels[2, i]
         kept += 1
     return kept
 
@@ -458,6 +463,7 @@ def _descend(
     variance: float,
     prior: np.ndarray,
     sign: float,
+    max_start: float,
     max_misfit: float,
     noise: float,
     enough_px: float,
@@ -478,6 +484,8 @@ def _descend(
         return np.nan
     damping, accepted = 1e-3, 0
     cost = _normal_equations(pixels, n, x, radius, variance, prior, J, H, g)
+    if cost > n * (4 * noise**2 + (max_start * x[_STEP]) ** 2):
+        return np.nan
     for _ in range(25):
         for half in range(2):
             if not _factor(H[half], damping, L):
@@ -504,7 +512,7 @@ def _descend(
         accepted += 1
         if move_px < enough_px:
             return cost / free
-        if accepted == 3 and cost > 4 * n * (noise**2 + (max_misfit * x[_STEP]) ** 2):
+        if accepted == 2 and cost > 4 * n * (noise**2 + (max_misfit * x[_STEP]) ** 2):
             return np.nan
     return np.nan
 
@@ -575,13 +583,16 @@ def fit_ellipses(
                 if sign * x[_STEP] < 0.5 * min_contrast * max(x[_AROUND], x[_AROUND] + x[_STEP]):
                     break
                 variance = max(1.0, 0.01 * x[_STEP] ** 2)
-            enough_px = 0.1 if attempt == 0 else 2e-3
-            variance = _descend(pixels, n, x, radius, variance, prior, sign, max_misfit, noise, enough_px, white, J, H)
+            # Newton's steps shrink so fast that what is left to go is far less than the last one.
+            enough_px = 0.1 if attempt == 0 else max(2e-3, 0.5 * sqrt(variance) / abs(x[_STEP]))
+            variance = _descend(
+                pixels, n, x, radius, variance, prior, sign, _MAX_START, max_misfit, noise, enough_px, white, J, H
+            )
             if not variance >= 0:
                 break
             variance = max(variance, _QUANTISATION_VARIANCE)
             needed = reach + 3.0 * max(0.0, x[_S] * radius - 0.8)
-            if is_rough or attempt > 0 and needed < margin + 1:
+            if is_rough or (attempt > 0 and needed < margin + 1):
                 break
         if not variance >= 0:
             continue
@@ -596,7 +607,20 @@ def fit_ellipses(
             n = _gather(image, u0, v0, radius, narrow, margin, margin + 2, pixels)
             if n > 2 * _N:
                 found = _descend(
-                    pixels, n, narrow, radius, variance, prior, sign, max_misfit, noise, enough_px, white, J, H_narrow
+                    pixels,
+                    n,
+                    narrow,
+                    radius,
+                    variance,
+                    prior,
+                    sign,
+                    _MAX_START,
+                    max_misfit,
+                    noise,
+                    enough_px,
+                    white,
+                    J,
+                    H_narrow,
                 )
                 found = max(found, _QUANTISATION_VARIANCE) if found >= 0 else np.inf
                 if found < variance:
@@ -623,8 +647,11 @@ def fit_ellipses(
         gradient[k] = x[2:_HALF] / radius
         unit = variance * scale
         out[k, COV_UU], out[k, COV_UV], out[k, COV_VV] = unit * c_uu + aliasing, unit * c_uv, unit * c_vv + aliasing
-        out[k, A] = sqrt(mean + spread)
-        out[k, B] = sqrt(max(mean - spread, 0.0))
+        # Blur draws the edge inwards by s²κ/2 where its curvature κ is less than 1/s, and by no more than s/2.
+        a, b = sqrt(mean + spread), sqrt(max(mean - spread, 1e-12))
+        at_ends, at_flanks = blur_px * a / (b * b), blur_px * b / (a * a)
+        out[k, A] = a + 0.5 * blur_px * at_ends / (1 + at_ends)
+        out[k, B] = b + 0.5 * blur_px * at_flanks / (1 + at_flanks)
         out[k, THETA] = 0.5 * atan2(2 * e_uv, e_uu - e_vv)
         out[k, BLUR], out[k, ALIASING] = blur_px, aliasing
         out[k, AROUND], out[k, STEP], out[k, RESIDUAL] = x[_AROUND], x[_STEP], sqrt(variance)
@@ -642,8 +669,8 @@ def share_gradients(
 
     A dot by itself hardly tells a gradient of the light from a shift of its edge, which costs a third of the accuracy.
     The mean and the spread of the gradients over the dots, by the method of moments beyond what the fits' own
-    errors make, take the place of the prior with which each was fitted (empirical Bayes; Efron & Morris 1973); that
-    prior counts as one more dot.
+    errors make, take the place of the prior with which each was fitted (empirical Bayes; Efron & Morris 1973). The
+    spread has the benefit of the doubt: one standard error of itself, or that prior as one dot more, if that is less.
     """
     m = len(fits)
     own, error = np.empty((m, 4)), np.empty((m, 4))  # estimates without the prior, and their variances
@@ -674,7 +701,8 @@ def share_gradients(
                     mean[c] = np.sum(weight * own[:, c]) / (np.sum(weight) + 1 / (prior[c] ** 2 + tau2))
                 top += np.sum(weight**2 * ((own[:, c] - mean[c]) ** 2 - np.minimum(error[:, c], 1e30)))
                 bottom += np.sum(weight**2)
-            tau2 = (max(0.0, top / max(bottom, 1e-300)) * m + prior[i] ** 2) / (m + 1)
+            found = max(0.0, top / max(bottom, 1e-300))
+            tau2 = min((m * found + prior[i] ** 2) / (m + 1), found + 1 / (np.mean(weight) * sqrt(m)))
         spread2[i:j] = tau2
     out = np.empty((m, 5))
     for k in range(m):
@@ -699,7 +727,7 @@ def share_gradients(
 def distinct(
     uv: Float[np.ndarray, "m 2"], reach: Float[np.ndarray, "m"], order: Int[np.ndarray, "m"]
 ) -> Bool[np.ndarray, "m"]:
-    """Which to keep of points, taken in the given order, so that none lies within its own reach or the other's of one kept."""
+    """Which points to keep, taken in the given order, so that no two lie within the reach of either."""
     m = len(uv)
     kept = np.zeros(m, np.bool_)
     rank = np.empty(m, np.int64)
@@ -733,15 +761,15 @@ def noise_samples(image: Grey, lag_px: int) -> Float[np.ndarray, "p"]:
     """
     h, w = image.shape
     step = max(1, int(sqrt(h * w / 4096)))
-    l, ll = lag_px, 2 * lag_px
-    out = np.empty(((h - ll - 1) // step + 1, (w - ll - 1) // step + 1))
+    one, two = lag_px, 2 * lag_px
+    out = np.empty(((h - two - 1) // step + 1, (w - two - 1) // step + 1))
     for i in range(out.shape[0]):
-        a, b, c = image[i * step], image[i * step + l], image[i * step + ll]
+        a, b, c = image[i * step], image[i * step + one], image[i * step + two]
         for j in range(out.shape[1]):
             u = j * step
-            corners = int(a[u]) + int(a[u + ll]) + int(c[u]) + int(c[u + ll])
-            sides = int(a[u + l]) + int(b[u]) + int(b[u + ll]) + int(c[u + l])
-            out[i, j] = abs(corners - 2 * sides + 4 * int(b[u + l]))
+            corners = int(a[u]) + int(a[u + two]) + int(c[u]) + int(c[u + two])
+            sides = int(a[u + one]) + int(b[u]) + int(b[u + two]) + int(c[u + one])
+            out[i, j] = abs(corners - 2 * sides + 4 * int(b[u + one]))
     return out.ravel()
 
 
@@ -753,7 +781,7 @@ def warm_up() -> None:
         image = np.where((u - 12) ** 2 + (v - 12) ** 2 < 20, 50, 200).astype(dtype)
         noise_samples(image, 1)
         low, high = block_extremes(image)
-        found = blobs(image, low, high, np.full_like(low, 50), np.full_like(low, 200), 0.2, 0.0, 3.0, 20.0, 0.3, 0.7)
+        found = blobs(image, low, high, np.full_like(low, 50), np.full_like(low, 200), 0.2, 0.0, 3.0, 20.0, 3.0, 0.3)
         fits, gradient, information = fit_ellipses(image, found, prior, 0.2, 0.12, 0.0, False)
     share_gradients(fits, gradient, information, prior)
     distinct(fits[:, :2].copy(), fits[:, B].copy(), np.arange(len(fits)))

@@ -39,11 +39,14 @@ from trifix.records import Dots, GreyOrColour
 # A level of the pyramid answers for blobs from 6.5 to 14 of its own pixels across (the finest also for smaller ones);
 # the limits overlap, since a dot may be measured a little larger or smaller from one level to the next.
 _LEVEL_MIN_PX, _LEVEL_MAX_PX, _WINDOW_BLOCKS = 6.5, 14.0, 7
-_MIN_FILL = 0.75
 _NOISE_RANGE = 9.0  # standard deviations that noise alone does not span within a window
 _LAG_PX = 6  # beyond which noise is not correlated
-# A dot whose step is less than _NOISE_RANGE deviations of correlated noise must leave no more than this fraction of it.
-_CLEAN = 0.03
+_LEAST_STEP = 4.0  # standard deviations of the noise of single pixels
+# Lumps of correlated noise or fine texture look like faint dots. Their steps are at most _LUMP of its standard
+# deviations where it is of a pixel's size; and at most _NOISE_RANGE where they leave more than a fraction _CLEAN of the
+# step or _WHITE times the noise of single pixels. Specks, of a short semi-axis up to _SPECK_PX, have too few pixels to
+# leave anything: theirs are at most _SPECK.
+_LUMP, _CLEAN, _WHITE, _SPECK, _SPECK_PX = 4.5, 0.03, 1.3, 6.0, 1.5
 _QUANTILE = {1.0: 0.6745, 0.5: 0.3186}  # of the magnitude of a normal number: the middle of all, of the lower half
 # Prior knowledge, as standard deviations: relative change of the light per pixel (u, v); departure from light that
 # multiplies both sides of the edge alike, in contrasts per pixel (u, v).
@@ -141,13 +144,13 @@ def _candidates(level: Grey, size: int, noise: float, options: DetectOptions) ->
         _NOISE_RANGE * noise,
         max(least_px / size, 0.0 if size == 1 else _LEVEL_MIN_PX),
         _LEVEL_MAX_PX,
+        options.min_diameter_px / size,
         0.9 * options.min_axis_ratio,
-        _MIN_FILL,
     )
     if options.polarity != "auto":
         found = found[found[:, SIGN] == (1.0 if options.polarity == "bright" else -1.0)]
     if size == 1 or len(found) == 0:
-        return found
+        return np.asarray(found)
     prior = _GRADIENT_PER_PX * size
     found = fit_ellipses(level, found, prior, options.min_contrast, 2 * options.max_misfit, noise, True)[0][
         :, : BLUR + 1
@@ -156,7 +159,7 @@ def _candidates(level: Grey, size: int, noise: float, options: DetectOptions) ->
     found[:, [U, V]] = size * found[:, [U, V]] + (size - 1) / 2
     found[:, UU : VV + 1] *= size**2
     found[:, BLUR] = 0.8
-    return found
+    return np.asarray(found)
 
 
 def _distinct_starts(start: Float[np.ndarray, "m 7"]) -> Float[np.ndarray, "k 7"]:
@@ -166,7 +169,7 @@ def _distinct_starts(start: Float[np.ndarray, "m 7"]) -> Float[np.ndarray, "k 7"
         rows = np.flatnonzero(start[:, SIGN] == sign)
         reach = 0.25 * (start[rows, UU] + start[rows, VV]) ** 0.5
         kept[rows[distinct(start[rows, : V + 1], reach, np.arange(len(rows)))]] = True
-    return start[kept]
+    return np.asarray(start[kept])
 
 
 def _is_good(
@@ -178,13 +181,18 @@ def _is_good(
     """
     u, v, a, b = fits[:, U], fits[:, V], fits[:, A], fits[:, B]
     around, step, misfit = fits[:, AROUND], fits[:, STEP], _misfit(fits, noise)
+    lumps = np.abs(step) / max(_noise(grey, _LAG_PX, 0.5), 1e-9)
+    is_clean = (misfit <= _CLEAN) | ((lumps >= _LUMP) & (fits[:, RESIDUAL] <= _WHITE * noise))
+    is_no_lump = (lumps >= _NOISE_RANGE) | (is_clean & ((lumps >= _SPECK) | (b > _SPECK_PX)))
     h, w = grey.shape
     return np.asarray(
         (2 * a >= options.min_diameter_px)
         & (2 * a <= options.max_diameter_px)
         & (b >= options.min_axis_ratio * a)
         & (np.abs(step) >= options.min_contrast * np.maximum(around, around + step))
-        & (misfit <= np.where(np.abs(step) < _NOISE_RANGE * _noise(grey, _LAG_PX, 0.5), _CLEAN, options.max_misfit))
+        & (misfit <= options.max_misfit)
+        & is_no_lump
+        & (np.abs(step) >= _LEAST_STEP * noise)
         & (np.minimum(u, v) >= a)
         & (u + a <= w - 1)
         & (v + a <= h - 1)

@@ -1,0 +1,313 @@
+"""The detector against what the light allows: bias, scatter, honesty, recall, false dots and time.
+
+Run: python benchmarks/detection.py
+
+Dots are rendered exactly: the share of each pixel's area that a blurred ellipse covers, integrated chord by chord. The
+bound is Cramér and Rao's for the image's noise where centre, axes, direction, blur and both grey levels are unknown.
+Time is compared with OpenCV's adaptiveThreshold and findContours on the same image, in turns.
+"""
+
+from dataclasses import replace
+from time import perf_counter
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+from rich.console import Console
+from rich.table import Table
+from scipy.special import ndtr
+
+from trifix.kernels import detection
+from trifix.sources.rendering import Renderer
+from trifix.sources.simulation import simulate_frames
+from trifix.stages.detect import DetectOptions, detect
+
+
+class Case(NamedTuple):
+    """Equal dots, at random phases and in random directions."""
+
+    diameter_px: float
+    tilt_deg: float
+    blur_px: float
+    around: float
+    inside: float
+    noise: float
+    light_per_px: float = 0.0
+
+
+DARK, BRIGHT, DEEP = (180.0, 30.0, 2.0), (20.0, 200.0, 2.0), (1500.0, 9000.0, 100.0)
+CASES = (
+    Case(6, 0, 0.7, *DARK),
+    Case(6, 60, 0.7, *DARK),
+    Case(6, 45, 0.7, *BRIGHT),
+    Case(10, 0, 0.7, *DEEP),
+    Case(10, 60, 0.6, *DARK, 0.001),
+    Case(16, 30, 1.0, *BRIGHT, 0.001),
+    Case(16, 60, 0.7, *DEEP),
+    Case(25, 45, 0.7, *DARK),
+    Case(40, 0, 1.0, *BRIGHT),
+    Case(40, 60, 0.7, *DARK),
+)
+
+
+class Accuracy(NamedTuple):
+    """What one case came to."""
+
+    bias_px: float
+    """Largest component of the mean error of noise-free images of 16 bit."""
+    worst_px: float
+    """Largest error of any noise-free dot."""
+    scatter: float
+    """Root mean square error in the noise, over the bound's."""
+    chi2: float
+    """Mean of the squared errors weighed by the stated covariances, over its expectation."""
+    beyond: float
+    """Share of them beyond what 5 % should exceed."""
+    below: float
+    """Share of them below what 5 % should."""
+
+
+def main(dots: int = 36, draws: int = 12, images: int = 60) -> None:
+    detection.warm_up()
+    table = Table("dots", "bias, px", "worst, px", "scatter / bound", "chi² / 2", "beyond 95 %", "below 5 %")
+    for case in CASES:
+        found = accuracy(case, dots, draws)
+        name = f"{case.diameter_px} px, {case.tilt_deg}°, {case.around:.0f} → {case.inside:.0f} ± {case.noise:.0f}"
+        table.add_row(name, *(f"{value:.4f}" for value in found[:2]), *(f"{value:.3f}" for value in found[2:]))
+    Console().print(table)
+    table = Table("images", "dots", "found, %", "false per 100 images", "centre rms, px", "ms")
+    for name, count in (("head", images), ("statue", images), ("sizes", images), ("correlated noise", images // 4)):
+        table.add_row(name, *searched(name, count))
+    Console().print(table)
+    table = Table("1280 x 1024, 63 dots", "detect, ms", "OpenCV, ms", "ratio")
+    for name, (ours, theirs) in timed().items():
+        table.add_row(name, f"{ours:.2f}", f"{theirs:.2f}", f"{ours / theirs:.2f}")
+    Console().print(table)
+
+
+def coverage(
+    u: float, v: float, a: float, b: float, theta: float, blur_px: float, box: tuple[slice, slice]
+) -> np.ndarray:
+    """Share of each pixel's area in a box (rows, columns) that a blurred ellipse covers.
+
+    The integral over each chord is in closed form; that over the chords is taken at the nodes of cos θ, where the
+    chords' ends are smooth.
+    """
+    pixels_v, pixels_u = np.arange(box[0].start, box[0].stop), np.arange(box[1].start, box[1].stop)
+    half = np.hypot(a * np.cos(theta), b * np.sin(theta))
+    n = int(40 * half / min(1.0, 3 * blur_px)) + 60
+    angle = (np.arange(n) + 0.5) * np.pi / n
+    x = half * np.cos(angle)
+    # Form E of the ellipse; its chord at x has its middle at E_uv / E_uu x and half-length √(det E / E_uu (1 - x²/E_uu)).
+    slope = (a**2 - b**2) * np.sin(theta) * np.cos(theta) / half**2
+    length = a * b / half * np.sin(angle)
+    weight = half * np.sin(angle) * np.pi / n
+    across = _box_normal(pixels_u[:, None] - u - x, blur_px) * weight
+    along = _box_normal_integral(pixels_v[:, None] - v - slope * x + length, blur_px) - _box_normal_integral(
+        pixels_v[:, None] - v - slope * x - length, blur_px
+    )
+    return np.asarray(along @ across.T)
+
+
+def _box_normal(t: np.ndarray, s: float) -> np.ndarray:
+    return np.asarray(ndtr((t + 0.5) / s) - ndtr((t - 0.5) / s))
+
+
+def _box_normal_integral(t: np.ndarray, s: float) -> np.ndarray:
+    return _ramp((t + 0.5) / s) * s - _ramp((t - 0.5) / s) * s
+
+
+def _ramp(z: np.ndarray) -> np.ndarray:
+    """Integral of the normal integral."""
+    return z * ndtr(z) + np.exp(-0.5 * z * z) / np.sqrt(2 * np.pi)
+
+
+def box_of(u: float, v: float, a: float, blur_px: float, shape: tuple[int, ...]) -> tuple[slice, slice]:
+    """The pixels that a dot reaches."""
+    reach = a + 6 * blur_px + 2
+    low = np.maximum(np.floor([v - reach, u - reach]).astype(int), 0)
+    high = np.minimum(np.ceil([v + reach, u + reach]).astype(int) + 1, shape)
+    return slice(low[0], high[0]), slice(low[1], high[1])
+
+
+def accuracy(case: Case, dots: int, draws: int) -> Accuracy:
+    rng = np.random.default_rng(int(case.diameter_px * 100 + case.tilt_deg))
+    rows = int(np.sqrt(dots))
+    pitch = int(case.diameter_px + 6 * case.blur_px + 14)
+    size = rows * pitch
+    v, u = np.mgrid[0:rows, 0:rows].reshape(2, -1) * pitch + pitch / 2 + rng.uniform(-0.5, 0.5, (2, rows**2))
+    a = case.diameter_px / 2
+    b = a * np.cos(np.radians(case.tilt_deg))
+    ellipses = [(*centre, a, b, theta) for *centre, theta in zip(u, v, rng.uniform(0, np.pi, rows**2), strict=True)]
+    covered = np.zeros((size, size))
+    bound = 0.0
+    for ellipse in ellipses:
+        box = box_of(*ellipse[:3], case.blur_px, covered.shape)
+        covered[box] += coverage(*ellipse, case.blur_px, box)
+        bound += np.trace(bound_px2(ellipse, case, box)) / len(ellipses)
+    light = 1 + case.light_per_px * (np.arange(size) - size / 2)
+    grey = (case.around + (case.inside - case.around) * covered) * light
+    options = DetectOptions(polarity="bright" if case.inside > case.around else "dark")
+    truth = np.stack([u, v], axis=1)
+
+    scale = 60000 / grey.max()
+    still, _ = errors(np.rint(grey * scale).astype(np.uint16), truth, options)
+    error, chi2 = [], []
+    for _ in range(draws):
+        noisy = np.rint(grey + case.noise * rng.standard_normal(grey.shape))
+        noisy = noisy.clip(0, None).astype(np.uint16 if grey.max() > 255 else np.uint8)
+        found, squares = errors(noisy, truth, options)
+        error.append(found)
+        chi2.append(squares)
+    squares = np.concatenate(chi2)
+    return Accuracy(
+        bias_px=float(np.abs(still.mean(axis=0)).max()),
+        worst_px=float(np.hypot(*still.T).max()),
+        scatter=float(np.sqrt(np.mean(np.sum(np.concatenate(error) ** 2, axis=1)) / bound)),
+        chi2=float(squares.mean() / 2),
+        beyond=float(np.mean(squares > 5.991)),
+        below=float(np.mean(squares < 0.1026)),
+    )
+
+
+def bound_px2(ellipse: tuple[float, ...], case: Case, box: tuple[slice, slice]) -> np.ndarray:
+    """Cramér-Rao bound of the covariance of a dot's centre."""
+    x = np.array([*ellipse[:2], *_form(*ellipse[2:]), case.blur_px])
+    step = 1e-3
+    columns = []
+    for i in range(len(x)):
+        high, low = x.copy(), x.copy()
+        high[i] += step
+        low[i] -= step
+        columns.append((_covered(high, box) - _covered(low, box)) / (2 * step) * (case.inside - case.around))
+    J = np.stack([*columns, np.ones(columns[0].size), _covered(x, box)], axis=1)
+    return np.asarray(np.linalg.inv(J.T @ J / (case.noise**2 + 1 / 12))[:2, :2])
+
+
+def _form(a: float, b: float, theta: float) -> tuple[float, float, float]:
+    c, s = np.cos(theta), np.sin(theta)
+    return (a * c) ** 2 + (b * s) ** 2, (a**2 - b**2) * c * s, (a * s) ** 2 + (b * c) ** 2
+
+
+def _covered(x: np.ndarray, box: tuple[slice, slice]) -> np.ndarray:
+    mean, spread = (x[2] + x[4]) / 2, np.hypot((x[2] - x[4]) / 2, x[3])
+    theta = 0.5 * np.arctan2(2 * x[3], x[2] - x[4])
+    return coverage(x[0], x[1], np.sqrt(mean + spread), np.sqrt(mean - spread), theta, x[5], box).ravel()
+
+
+def errors(image: np.ndarray, truth: np.ndarray, options: DetectOptions) -> tuple[np.ndarray, np.ndarray]:
+    """Errors of the dots found (px), and their squares weighed by the stated covariances."""
+    dots = detect(image, options)
+    distance = np.hypot(*(truth[:, None] - dots.uv_px[None]).transpose(2, 0, 1))
+    target, dot = np.nonzero(distance < 1.0)
+    error = dots.uv_px[dot] - truth[target]
+    return error, np.einsum("ni,ni->n", error, np.linalg.solve(dots.cov_px2[dot], error[:, :, None])[:, :, 0])
+
+
+def searched(name: str, images: int) -> tuple[str, ...]:
+    """Dots, share found, false ones per 100 images, rms error and median time of one kind of scene."""
+    true, found, false, squares, ms = 0, 0, 0, [], []
+    for image, uv in scenes(name, images):
+        start = perf_counter()
+        dots = detect(image)
+        ms.append(1e3 * (perf_counter() - start))
+        if len(uv) == 0:
+            false += len(dots)
+            continue
+        distance = np.hypot(*(uv[:, None] - dots.uv_px[None]).transpose(2, 0, 1))
+        hit = distance.min(axis=1, initial=np.inf) < 1.0
+        true, found = true + len(uv), found + int(hit.sum())
+        false += int((distance.min(axis=0, initial=np.inf) > 3.0).sum())
+        squares.append(distance.min(axis=1, initial=np.inf)[hit] ** 2)
+    rms = float(np.sqrt(np.mean(np.concatenate(squares)))) if squares else np.nan
+    share = 100 * found / true if true else np.nan
+    return f"{true}", f"{share:.2f}", f"{100 * false / images:.1f}", f"{rms:.3f}", f"{np.median(ms):.2f}"
+
+
+def scenes(name: str, images: int):  # type: ignore[no-untyped-def]
+    """Images and the true centres in them."""
+    rng = np.random.default_rng(1)
+    for k in range(images):
+        if name == "sizes":
+            yield all_sizes(rng)
+        elif name == "correlated noise":
+            noise = cv2.GaussianBlur(rng.standard_normal((1024, 1280)), (0, 0), rng.uniform(0.5, 1.5))
+            image = 100 + rng.uniform(3, 15) * noise / noise.std()
+            yield np.clip(np.rint(image), 0, 255).astype(np.uint8), np.zeros((0, 2))
+        elif k == 0:
+            made = simulate_frames(name, 0, "images", images)
+            scene = replace(made.scene, sensing=replace(made.scene.sensing, ghosts_per_image=0.0))
+            renderer = Renderer(scene)
+            for i in range(images):
+                seen = made.seen[0]
+                rows = seen.of_frame(i)
+                image = renderer.render(i, np.random.default_rng(i))[0]
+                h, w = image.shape
+                uv, d = seen.uv_px[rows], seen.diameter_px[rows]
+                whole = (np.minimum(uv, [w - 1, h - 1] - uv) > d[:, None]).all(axis=1)
+                yield image, uv[whole & (d >= 5)]
+
+
+def all_sizes(rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+    """Dots of 5 to 200 px, tilted to 65°, on stickers on a textured ground in uneven light, dark ones or bright ones."""
+    h, w = 1024, 1280
+    ground = np.zeros((h, w))
+    for scale_px in (1, 2, 4, 8, 16, 32):
+        small = rng.standard_normal((h // scale_px + 1, w // scale_px + 1)).astype(np.float32)
+        ground += cv2.resize(small, (w, h), interpolation=cv2.INTER_CUBIC)
+    ground = 100 + rng.uniform(3, 12) * ground
+    is_bright = rng.random() < 0.5
+    blur_px = rng.uniform(0.45, 1.0)
+    sticker, dot = (25.0, 210.0) if is_bright else (210.0, 30.0)
+    placed: list[tuple[float, float, float]] = []
+    uv = []
+    for _ in range(80):
+        a = 0.5 * np.exp(rng.uniform(np.log(5), np.log(200)))
+        b, theta = a * np.cos(np.radians(rng.uniform(0, 65))), rng.uniform(0, np.pi)
+        rim = 1.4 * a + 3
+        u, v = rng.uniform(rim + 1, w - rim - 2), rng.uniform(rim + 1, h - rim - 2)
+        if any(np.hypot(u - x, v - y) < rim + r + 2 for x, y, r in placed):
+            continue
+        placed.append((u, v, rim))
+        box = box_of(u, v, rim, blur_px, ground.shape)
+        ground[box] += (sticker - ground[box]) * coverage(u, v, rim, b * rim / a, theta, blur_px, box)
+        ground[box] += (dot - ground[box]) * coverage(u, v, a, b, theta, blur_px, box)
+        uv.append((u, v))
+    light = 1 - 0.3 * ((np.arange(w) / w - 0.4) ** 2 + ((np.arange(h) / h - 0.5) ** 2)[:, None])
+    noisy = np.rint(ground * light + 2 * rng.standard_normal((h, w)))
+    return noisy.clip(0, 255).astype(np.uint8), np.array(uv)
+
+
+def timed(repeats: int = 60) -> dict[str, tuple[float, float]]:
+    """Milliseconds of the detector and of OpenCV's threshold and contours, medians of runs in turns."""
+    rng = np.random.default_rng(2)
+    covered = np.zeros((1024, 1280))
+    v, u = np.mgrid[0:7, 0:9].reshape(2, -1) * 140.0 + rng.uniform(70, 110, (2, 63))
+    for x, y in zip(u, v, strict=True):
+        a = rng.uniform(4, 14)
+        ellipse = (x, y, a, a * np.cos(np.radians(rng.uniform(0, 60))), rng.uniform(0, np.pi))
+        box = box_of(x, y, a, 1.0, covered.shape)
+        covered[box] += coverage(*ellipse, 1.0, box)
+    image = np.rint(180 - 150 * covered + 2 * rng.standard_normal(covered.shape)).clip(0, 255).astype(np.uint8)
+    ways = {
+        "OpenCV": lambda: contours(image),
+        "dark": lambda: detect(image, DetectOptions(polarity="dark")),
+        "auto": lambda: detect(image),
+    }
+    ms: dict[str, list[float]] = {name: [] for name in ways}
+    for _ in range(repeats):
+        for name, way in ways.items():
+            start = perf_counter()
+            way()
+            ms[name].append(1e3 * (perf_counter() - start))
+    theirs = float(np.median(ms.pop("OpenCV")))
+    return {name: (float(np.median(one)), theirs) for name, one in ms.items()}
+
+
+def contours(image: np.ndarray) -> int:
+    binary = cv2.adaptiveThreshold(image, 255, cv2.ADAPTIVE_THRESH_MEAN_C, cv2.THRESH_BINARY_INV, 51, 10)
+    return len(cv2.findContours(binary, cv2.RETR_LIST, cv2.CHAIN_APPROX_NONE)[0])
+
+
+if __name__ == "__main__":
+    main()
