@@ -11,7 +11,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 
 from trifix.errors import ConfigError
 from trifix.geometry.pose import Pose
@@ -118,7 +118,9 @@ _AGREEMENT = 1e-3  # probability below which a pose does not follow from the ear
 _MAX_STRAYS = 5  # frames in a row that may have been positioned falsely
 _MIN_TURNS = 2  # frames that must show one of two targets alone even where other pairs lie apart alike
 _ALIKE = 0.3  # share of their distance by which two pairs may lie apart differently
-_MEDIAN_CHI2 = 2.37  # of three degrees
+_RESTLESS = 0.25  # share of the largest allowed χ² of a bias, seldom reached where the map is sound
+_FEW = 0.05  # share of a frame's targets that may reach it: where more do, the map drifts or the calibration is off
+_CLEAR_SIGMAS = 6.0  # two targets are clearly apart beyond this, were the covariances right
 _EXACT_MM2 = 1e-12  # what a covariance of zero is taken for
 _AT_MOST = 3.0  # standard deviations that the farthest place stands for which can be reached at the pace that was
 _CROWD = 2  # witnesses to each target that has moved: where more go together, it is the map that drifted
@@ -139,6 +141,7 @@ class Care:
         self._turns: dict[tuple[int, int], int] = {}
         self._arrived: set[int] = set()
         self._strayed = np.zeros(0, dtype=np.int64)
+        self._is_calm = True
         self._journal: deque[Lesson] = deque(maxlen=options.remembered)
         self._misses = np.zeros(0, dtype=np.int64)
         self._count = np.zeros((0, kernels.COLUMNS), dtype=np.int64)
@@ -263,22 +266,20 @@ class Care:
             self._count,
             self._bias,
         )
-        if found[:, 0].max(initial=0.0) <= self._max_bias:
+        chi2 = found[:, 0]
+        is_biased, is_restless = chi2 > self._max_bias, chi2 > _RESTLESS * self._max_bias
+        self._is_calm = bool(is_restless.sum() <= 1 + _FEW * len(chi2))
+        if not (self._is_calm and is_biased.any()):
             return map, []
-        # where all residuals are larger than stated, each is judged against the others
-        chi2 = found[:, 0] / max(1.0, float(np.median(found[:, 0])) / _MEDIAN_CHI2)
         row = np.concatenate([fix.target, missed])
         is_sure = (
-            (chi2 > self._max_bias)
+            is_biased
             & (self._count[row, WEIGHED] >= _MIN_WEIGHED)
             & (self._count[row, HITS] >= _MIN_HITS)
             & (map.state[row] == _TRUSTED)
             & (found[:, 2] > options.min_shift_sigmas)
         )
         suspect = np.flatnonzero(is_sure)
-        biased = int((chi2 > 0.5 * self._max_bias).sum())
-        if len(suspect) == 0 or _CROWD * biased > len(fix.target) - biased:
-            return map, []
         events: list[Event] = []
         for k in suspect.tolist():
             target = int(map.id[row[k]])
@@ -288,7 +289,7 @@ class Care:
         return _in_state(map, row[suspect], _QUARANTINED), events
 
     def _find_again(self, map: ReferenceMap, seen: Int[np.ndarray, "c"]) -> list[Event]:
-        """Tells which of the targets put aside have moved: one that came since, and stays, is seen beside their place."""
+        """Tells which of the targets put aside have moved: one that came since and stays is beside their place."""
         count = self._count
         new = integers(seen[(map.state[seen] == _TRUSTED) & (count[seen, HITS] >= _MIN_HITS)])
         apart_mm = self._options.min_apart * self._apart_mm if np.isfinite(self._apart_mm) else 0.0
@@ -335,10 +336,15 @@ class Care:
         map, events = map.copy(), list[Event]()
         if near:
             pairs = np.array(near, dtype=np.int64)
-            pairs = pairs[self._is_one(map, pairs, apart_mm)]
+            d2 = _mahalanobis2(map, pairs)
+            d_mm = np.linalg.norm(map.xyz_mm[pairs[:, 0]] - map.xyz_mm[pairs[:, 1]], axis=1)
+            is_one = (d2 < options.explained_sigmas**2) | (d_mm < apart_mm)
+            pairs, is_clear = pairs[is_one], d2[is_one] > _CLEAR_SIGMAS**2
             k = np.searchsorted(missed, pairs[:, 0])
             came_since = count[pairs[:, 1], FIRST] > count[pairs[:, 0], LAST]
-            has_moved = came_since & (_CROWD * np.unique(pairs[came_since, 0]).size <= witnesses[k])
+            has_moved = (
+                self._is_calm & is_clear & came_since & (_CROWD * np.unique(pairs[came_since, 0]).size <= witnesses[k])
+            )
             events += self._merge(map, pairs[~has_moved])
             is_due = has_moved & (misses[k] >= options.moved_after)
             for a, b in pairs[is_due].tolist():
@@ -357,13 +363,6 @@ class Care:
                 detail = f"missed in {misses[k]} frames that should have seen it, after frame {map.last_seen[a]}"
                 events.append(Event("target_removed", int(map.id[a]), detail))
         return map, events
-
-    def _is_one(self, map: ReferenceMap, pairs: Int[np.ndarray, "m 2"], apart_mm: float) -> Bool[np.ndarray, "m"]:
-        """Whether the two targets of each pair cannot both be there: too near, or not told apart by covariance."""
-        r = map.xyz_mm[pairs[:, 0]] - map.xyz_mm[pairs[:, 1]]
-        C = map.cov_mm2[pairs[:, 0]] + map.cov_mm2[pairs[:, 1]] + _EXACT_MM2 * np.eye(3)
-        d2 = np.einsum("ni,ni->n", r, np.linalg.solve(C, r[:, :, None])[:, :, 0])
-        return np.asarray((d2 < self._options.explained_sigmas**2) | (np.linalg.norm(r, axis=1) < apart_mm))
 
     def _successor(self, map: ReferenceMap, row: int) -> int | None:
         """The row of the target that a missing one has become: of those that came since, each the other's nearest."""
@@ -532,6 +531,13 @@ def _information(map: ReferenceMap, row: int) -> tuple[Float[np.ndarray, "3 3"],
         return None
     A = np.linalg.inv(C)
     return A, A @ map.xyz_mm[row]
+
+
+def _mahalanobis2(map: ReferenceMap, pairs: Int[np.ndarray, "m 2"]) -> Float[np.ndarray, "m"]:
+    """Squared distances of pairs of targets in standard deviations."""
+    r = map.xyz_mm[pairs[:, 0]] - map.xyz_mm[pairs[:, 1]]
+    C = map.cov_mm2[pairs[:, 0]] + map.cov_mm2[pairs[:, 1]] + _EXACT_MM2 * np.eye(3)
+    return np.asarray(np.einsum("ni,ni->n", r, np.linalg.solve(C, r[:, :, None])[:, :, 0]))
 
 
 def _unite(map: ReferenceMap, stays: int, goes: int, explained_sigmas: float) -> None:
