@@ -99,7 +99,7 @@ def test_old_residuals_are_forgotten():
 
 def test_too_few_pairs_say_nothing():
     rng, noise = np.random.default_rng(5), NoiseScale()
-    noise = weigh_matches(noise, pairs_of_a_frame(rng, 0.3, noise, 0.0, OPTIONS.min_samples - 1), GATE, False, OPTIONS)
+    noise = weigh_matches(noise, pairs_of_a_frame(rng, 0.3, noise, 0.0, OPTIONS.few_samples - 1), GATE, False, OPTIONS)
     assert noise.scale == 1.0
     assert not noise.is_known
     noise = weigh_matches(noise, pairs_of_a_frame(rng, 0.3, noise, 0.0, 100), GATE, False, OPTIONS)
@@ -191,7 +191,8 @@ def test_detected_dots_start_with_the_prior_noise_on_top_of_their_own():
 
 
 @pytest.mark.parametrize(
-    ("values", "text"), [({"sigma_px": 0.0}, "noise.sigma_px is 0.0"), ({"min_samples": 0}, "noise.min_samples")]
+    ("values", "text"),
+    [({"sigma_px": 0.0}, "noise.sigma_px is 0.0"), ({"min_samples": 0}, "noise.few_samples and min_samples")],
 )
 def test_impossible_options_are_refused(values, text):
     with pytest.raises(ConfigError, match=text):

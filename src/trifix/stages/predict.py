@@ -17,7 +17,7 @@ from trifix.records import Prediction
 class PredictOptions:
     """How a hand may move."""
 
-    max_gap_s: float = 0.3
+    max_gap_s: float = 1.0
     """No prediction later than this after the last fix (s)."""
     speed_mm_s: float = 250.0
     """Standard deviation of the velocity along each axis, while it is unknown (mm/s)."""
@@ -58,17 +58,21 @@ def follow(motion: Motion | None, timestamp_ns: int, T_world_sensor: Pose) -> Mo
 
 
 def predict(motion: Motion | None, timestamp_ns: int, options: PredictOptions) -> Prediction | None:
-    """The pose at a time by constant velocity, or at rest after a single fix; None when the last fix is too old."""
+    """The pose at a time by constant velocity, or where it was; None when the last fix is too old.
+
+    Whichever is surer: after a single fix, or a long while, no velocity is known any more.
+    """
     if motion is None:
         return None
     gap_s = 1e-9 * (timestamp_ns - motion.newest_ns)
     if not 0 < gap_s <= options.max_gap_s:
         return None
+    resting = gap_s * np.repeat([options.speed_mm_s, options.turn_rad_s], 3)
     step_s = 1e-9 * (motion.newest_ns - motion.before_ns)
     if 0 < step_s <= options.max_gap_s:
         velocity = (motion.before.inverse() @ motion.newest).log() / step_s
         reach_s2 = gap_s * (gap_s + step_s)  # twice the error that a constant acceleration makes
         sigma = 0.5 * reach_s2 * np.repeat([options.acceleration_mm_s2, options.angular_acceleration_rad_s2], 3)
-        return Prediction(motion.newest @ Pose.exp(velocity * gap_s), np.diag(sigma**2))
-    sigma = gap_s * np.repeat([options.speed_mm_s, options.turn_rad_s], 3)
-    return Prediction(motion.newest, np.diag(sigma**2))
+        if (sigma < resting).all():
+            return Prediction(motion.newest @ Pose.exp(velocity * gap_s), np.diag(sigma**2))
+    return Prediction(motion.newest, np.diag(resting**2))

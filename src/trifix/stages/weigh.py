@@ -28,7 +28,9 @@ class NoiseOptions:
     sigma_px: float = 0.3
     """Standard deviation of a dot's centre along each axis to start from, where the recording states none (px)."""
     min_samples: int = 100
-    """Residuals to await before the scale leaves 1."""
+    """Residuals to await before a stated noise is doubted."""
+    few_samples: int = 12
+    """Residuals to await before the scale leaves 1 where none is stated; it is taken larger while they are few."""
     max_samples: int = 4000
     """Residuals to remember; the oldest go first."""
     stated_low: float = 0.7
@@ -39,8 +41,8 @@ class NoiseOptions:
     def __post_init__(self) -> None:
         if self.sigma_px <= 0:
             raise ConfigError(f"noise.sigma_px is {self.sigma_px}, expected a positive number of pixels.")
-        if not 0 < self.min_samples <= self.max_samples:
-            raise ConfigError("noise.min_samples must be positive and at most noise.max_samples.")
+        if min(self.few_samples, self.min_samples) <= 0 or self.min_samples > self.max_samples:
+            raise ConfigError("noise.few_samples and min_samples must be positive and at most noise.max_samples.")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -99,7 +101,7 @@ def weigh_matches(
         return noise
     z = np.abs(matches.epipolar_px) / matches.epipolar_sigma_px
     noise = _remember(noise, z, max_sigmas * noise.scale)
-    if _is_due(noise, options):
+    if _is_due(noise, is_stated, options):
         noise = _recent(noise, options)
         return _with_scale(noise, _likeliest_scale(noise)[0], is_stated, options)
     if is_stated and not noise.is_known and not noise.is_doubted:
@@ -135,7 +137,7 @@ def weigh_residuals(
         floats(fix.T_world_sensor.t_mm),
     )
     noise = _remember(noise, noise.scale * np.sqrt(chi2 * (c / (c - 2) / _CHI2_3_MEDIAN)), np.inf)
-    if not _is_due(noise, options):
+    if not _is_due(noise, is_stated, options):
         return noise
     noise = _recent(noise, options)
     return _with_scale(noise, float(np.median(np.concatenate(noise.sigmas))), is_stated, options)
@@ -157,10 +159,10 @@ def _remember(noise: NoiseScale, z: Float[np.ndarray, "n"], gate: float) -> Nois
     return replace(noise, sigmas=(*noise.sigmas, z), gates=(*noise.gates, gate), seen=noise.seen + len(z))
 
 
-def _is_due(noise: NoiseScale, options: NoiseOptions) -> bool:
+def _is_due(noise: NoiseScale, is_stated: bool, options: NoiseOptions) -> bool:
     """A new fit pays when a quarter more has been seen."""
     grown = noise.seen >= 1.25 * noise.fitted_at or noise.seen - noise.fitted_at >= options.max_samples // 2
-    return noise.seen >= options.min_samples and grown
+    return noise.seen >= (options.min_samples if is_stated else options.few_samples) and grown
 
 
 def _recent(noise: NoiseScale, options: NoiseOptions) -> NoiseScale:
@@ -175,7 +177,9 @@ def _recent(noise: NoiseScale, options: NoiseOptions) -> NoiseScale:
 
 
 def _with_scale(noise: NoiseScale, scale: float, is_stated: bool, options: NoiseOptions) -> NoiseScale:
-    if is_stated and options.stated_low <= scale <= options.stated_high:
+    if not is_stated:
+        scale *= 1 + 1 / np.sqrt(2 * noise.seen)  # one standard deviation more: too large does less harm than too small
+    elif options.stated_low <= scale <= options.stated_high:
         scale = 1.0
     return replace(noise, scale=float(np.clip(scale, _SCALES[0], _SCALES[-1])), fitted_at=noise.seen)
 
