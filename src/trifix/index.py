@@ -12,6 +12,9 @@ from jaxtyping import Float, Float32, Int, Int32
 from trifix.kernels import index as kernels
 from trifix.records import ReferenceMap, SensorPoints, TargetState
 
+ANYWHERE_UP_TO = 300
+"""Targets of a map in which triangles of any size are worth a search; near ones have to do in larger maps."""
+
 _ALIVE = int(TargetState.trusted)  # states up to this one are indexed
 _SAMPLE = 64  # targets from which the spacing is judged
 _SPACING_RATIO = 1.5  # a spacing that is off by more is corrected
@@ -52,6 +55,7 @@ class MapIndex:
         self._widest_mm2 = 0.0  # no target's covariance has a larger trace
         self._given = 0  # rows looked at since all were
         self._version = 0
+        self._evidence: tuple[int, int, float] | None = None  # found at this version, for variances of this octave
         self._pairs: tuple[int, kernels.PairTable] | None = None  # made at this version
 
     def follow(self, map: ReferenceMap, rows: Int[np.ndarray, "r"] | None = None) -> None:
@@ -109,6 +113,21 @@ class MapIndex:
             limit,
         )
         return Candidates(point, target, row, tried, by_chance)
+
+    def largest_evidence(self, points: SensorPoints, map: ReferenceMap) -> float:
+        """ln of the likelihood ratio against chance that one of these points can reach at most, on any target.
+
+        Reached by a point that is exactly at the target that lies most alone.
+        """
+        variance = kernels.smallest_variance(points.cov_mm2)
+        octave = int(np.floor(np.log2(variance))) if np.isfinite(variance) and variance > 0 else 0
+        if self._evidence is None or self._evidence[:2] != (self._version, octave):
+            self._evidence = self._version, octave, kernels.largest_evidence(self._store, map.xyz_mm, 2.0**octave)
+        return self._evidence[2]
+
+    def all_triangles(self) -> Int[np.ndarray, "t 3"]:
+        """Rows of the targets of every local triangle."""
+        return np.asarray(kernels.all_triangles(self._store))
 
     def any(
         self,

@@ -792,6 +792,62 @@ def turns(triangles: Int[np.ndarray, "t 3"], points: int) -> Int[np.ndarray, "t"
     return out
 
 
+@njit(cache=True, nogil=True)
+def all_triangles(store):
+    """Rows of the targets of every triangle in the index."""
+    out = np.empty((len(store.id) * PAIRS, 3), np.int64)
+    count = 0
+    for p in range(len(store.id)):
+        if store.id[p] < 0:
+            continue
+        for i in range(NEIGHBOURS):
+            for j in range(i + 1, NEIGHBOURS):
+                if store.neighbour[p, j] >= 0 and _side_bucket(store, p, i, j) >= 0:
+                    out[count, 0], out[count, 1], out[count, 2] = p, store.neighbour[p, i], store.neighbour[p, j]
+                    count += 1
+    return out[:count]
+
+
+# --- evidence --------------------------------------------------------------------------------------------------------
+
+
+@njit(cache=True, nogil=True)
+def smallest_variance(cov):
+    """No point's variance along any axis is smaller (mm²): λ₁λ₂ ≤ (trace / 2)², so λ₃ ≥ det / (trace / 2)²."""
+    least = np.inf
+    for n in range(len(cov)):
+        a, b, c, d, e, f = cov[n, 0, 0], cov[n, 0, 1], cov[n, 0, 2], cov[n, 1, 1], cov[n, 1, 2], cov[n, 2, 2]
+        det = a * (d * f - e * e) + b * (c * e - b * f) + c * (b * e - c * d)
+        half = 0.5 * (a + d + f)
+        if half > 0:
+            least = min(least, det / (half * half))
+    return least
+
+
+@njit(cache=True, nogil=True)
+def largest_evidence(store, xyz, variance):
+    """ln of the largest √det(I + Σ / σ²) / (m / 2) of any target, Σ the mean square offsets of its m ≤ 5 nearest."""
+    most = np.log(2.0)
+    for p in range(len(store.id)):
+        if store.id[p] < 0:
+            continue
+        a = b = c = d = e = f = 0.0
+        m = 0
+        while m < 5 and store.neighbour[p, m] >= 0:
+            q = store.neighbour[p, m]
+            x, y, z = xyz[q, 0] - xyz[p, 0], xyz[q, 1] - xyz[p, 1], xyz[q, 2] - xyz[p, 2]
+            a, b, c, d, e, f = a + x * x, b + x * y, c + x * z, d + y * y, e + y * z, f + z * z
+            m += 1
+        if m == 0:
+            m = 1
+            a = d = f = 16 * store.cell_mm**2
+        g = 1.0 / (m * variance)
+        a, b, c, d, e, f = 1 + a * g, b * g, c * g, 1 + d * g, e * g, 1 + f * g
+        det = a * (d * f - e * e) + b * (c * e - b * f) + c * (b * e - c * d)
+        most = max(most, 0.5 * np.log(det) - np.log(0.5 * m))
+    return most
+
+
 def warm_up() -> None:
     """Compiles every loop of this module for the types that it meets in use."""
     xyz = np.array([[0.0, 0.0, 400.0], [40.0, 0.0, 410.0], [0.0, 60.0, 420.0], [50.0, 70.0, 400.0]])
@@ -808,5 +864,7 @@ def warm_up() -> None:
     turns(frame, len(xyz))
     scene = (frame, xyz, cov, xyz, cov, view, 0.01, 3.0, 0.0, 9)
     match_local(store, *scene)
+    all_triangles(store)
+    largest_evidence(store, xyz, smallest_variance(cov))
     start, _ = count_pairs(store.anchor, rows, 0, 100, 1.0, 9)
     match_any(store, list_pairs(store.anchor, rows, 0, start, 1.0), *scene, 99)
