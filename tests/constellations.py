@@ -7,6 +7,7 @@ import numpy as np
 
 from trifix.geometry.camera import Camera, StereoRig
 from trifix.geometry.pose import Pose, exp_rotation
+from trifix.index import MapIndex
 from trifix.records import (
     Dots,
     Fix,
@@ -68,6 +69,13 @@ def seen_points(xyz_world_mm: np.ndarray, T_world_sensor: Pose, rng: np.random.G
     xyz = T_world_sensor.inverse().apply(xyz_world_mm)
     cov = sensor_covariances(xyz)
     return points_of(xyz + noise(rng, cov), cov)
+
+
+def indexed(map: ReferenceMap) -> MapIndex:
+    """The index of a map."""
+    index = MapIndex()
+    index.follow(map)
+    return index
 
 
 def noise(rng: np.random.Generator, cov: np.ndarray) -> np.ndarray:

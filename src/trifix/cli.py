@@ -53,7 +53,7 @@ def _is_setting(_: object, settings: tuple[str, ...]) -> None:
 
 
 Level = Literal["images", "dots", "points"]
-Technique = Literal["frequency", "minimal", "delaunay", "triangles", "hashing", "distances", "icp"]
+Technique = Literal["index", "frequency", "minimal", "delaunay", "triangles", "hashing", "distances", "icp"]
 Out = Annotated[Path, Parameter(name=["--out", "-o"])]
 Names = Annotated[tuple[str, ...], Parameter(consume_multiple=True, show_default=False)]
 Settings = Annotated[tuple[str, ...], Parameter(name="--set", validator=_is_setting, show_default=False)]

@@ -4,10 +4,9 @@ What belongs to such a map goes with it: the memory of the matching technique an
 Knows no image and no other island, but for the moment in which it absorbs one.
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
-from itertools import chain
 from time import perf_counter
 from typing import assert_never
 
@@ -17,13 +16,13 @@ from jaxtyping import Float, Int
 from trifix.config import Config
 from trifix.geometry.alignment import point_jacobian
 from trifix.geometry.pose import Pose
+from trifix.index import MapIndex
 from trifix.records import (
     Event,
     Fix,
     Frame,
     Identification,
     NoFix,
-    Orientations,
     PositionedReason,
     Prediction,
     Reason,
@@ -31,27 +30,35 @@ from trifix.records import (
     SensorPoints,
     StereoMatches,
 )
-from trifix.stages.identify import AllTriangles, identifier
+from trifix.stages.identify import AS_PREDICTED, any_triangles, identifier
 from trifix.stages.orient import orient
 from trifix.stages.predict import Motion, follow, predict
 from trifix.stages.tend import Care, Hand
 from trifix.stages.update import found_map, update
-from trifix.stages.verify import verify
+from trifix.stages.verify import Evidence, fewest_points, verify
 from trifix.stages.verify_residual import verify_residual
 
-_WIDENED_POINTS, _WIDENED_TARGETS = 40, 300  # beyond, all triangles would take too long
-_WIDENED_PORTION = 50_000
+_UNDECIDED = (Reason.no_candidate, Reason.not_proven, Reason.residual)
 NOTHING = np.zeros(0, dtype=np.int64)
 
 
 class Island:
     """One map, and everything that is remembered with it."""
 
-    def __init__(self, number: int, config: Config, map: ReferenceMap, is_frozen: bool = False) -> None:
+    def __init__(
+        self,
+        number: int,
+        config: Config,
+        map: ReferenceMap,
+        is_frozen: bool = False,
+        T_world_island: Prediction | None = None,
+    ) -> None:
         self.number = number
         self.map = map
         self.frames = 0
         self.is_absorbed = False
+        self.T_world_island = T_world_island
+        """Where the island lies if the sensor moved on as it did before it was founded."""
         self.removed = NOTHING
         """Identities of the targets that the last lesson took out of the map."""
         self.events: list[Event] = []
@@ -60,55 +67,82 @@ class Island:
         move = config.predict
         self._hand = Hand(move.acceleration_mm_s2, move.angular_acceleration_rad_s2, move.max_gap_s)
         self._gauge = np.zeros((6, 6))
-        self._all_triangles = AllTriangles(config.identify)
-        self._widened_for: ReferenceMap | None = None
         self.motion: Motion | None = None
         self._config = config
         self._is_frozen = is_frozen
-        self.identifier = identifier(config.identify)
+        self.index = MapIndex()
+        self.index.follow(map)
+        self.identifier = identifier(config.identify, self.index)
         self.identifier.learn(map, NOTHING)
 
+    def predicted(self, timestamp_ns: int) -> Prediction | None:
+        """Where the sensor should be at a time, if it was here not long before."""
+        return predict(self.motion, timestamp_ns, self._config.predict)
+
     def position(
-        self,
-        points: SensorPoints,
-        matches: StereoMatches | None,
-        timestamp_ns: int | None,
-        clock: "Stopwatch",
+        self, evidence: Evidence, prediction: Prediction | None, clock: "Stopwatch"
     ) -> tuple[Identification | None, Fix | NoFix]:
-        """Points to hypotheses to poses to the one that is proven; without a time, no motion speaks for any."""
-        best, tried = NoFix(Reason.no_candidate), 0
-        prediction = None if timestamp_ns is None else predict(self.motion, timestamp_ns, self._config.predict)
-        last_pose = self.motion.newest if self.motion else None
-        portions = chain(self.identifier.identify(points, self.map, last_pose), self._widened(points))
-        identification = None
-        while best.why in (Reason.no_candidate, Reason.not_proven, Reason.residual):
+        """Points to hypotheses to poses to the one that is proven; where points leave it open, single dots decide."""
+        budget = self._config.identify.max_hypotheses
+        best, likeliest, tried = NoFix(Reason.no_candidate), None, list[Identification]()
+        portions = self._hypotheses(evidence.points, prediction)
+        while True:
             with clock("identify"):
                 portion = next(portions, None)
             if portion is None:
                 break
-            identification = portion
-            with clock("orient"):
-                orientations = orient(points, self.map, identification)
-            with clock("verify"):
-                fix = self._verify(points, matches, identification, orientations, tried, prediction)
-            if isinstance(fix, Fix):
-                return identification, fix
-            if fix.why is not Reason.no_candidate:
-                best = fix
-            tried += len(identification)
-        return identification, best
+            fix = self._judge(evidence, portion, tried, prediction, clock)
+            if isinstance(fix, Fix) or fix.why not in _UNDECIDED:
+                return portion, fix
+            tried.append(portion)
+            if likeliest is None or not fix.p_chance >= best.p_chance:
+                best, likeliest = fix, portion
+            if (number := sum(len(each) for each in tried)) >= budget:
+                detail = f"{number} hypotheses were tried, and at most {budget} are. {best.detail}".strip()
+                return likeliest, replace(best, why=Reason.out_of_time, detail=detail)
+        if evidence.dots is not None and likeliest is not None:
+            for portion in {id(each): each for each in (likeliest, tried[0])}.values():
+                others = [each for each in tried if each is not portion]
+                fix = self._judge(evidence, portion, others, prediction, clock, asks_dots=True)
+                if isinstance(fix, Fix):
+                    return portion, fix
+        return likeliest, best
 
-    def _widened(self, points: SensorPoints) -> Iterator[Identification]:
-        """All triangles, or those of near targets where that would be too many, for what the technique did not find."""
+    def _hypotheses(self, points: SensorPoints, prediction: Prediction | None) -> Iterator[Identification]:
+        """Where the motion leads, first; then from nothing: those of the technique, and then any triangle at all."""
         options = self._config.identify
-        targets = int(self.map.alive.sum())
-        if not options.widens or len(points) > _WIDENED_POINTS or targets > _WIDENED_TARGETS:
+        if prediction is not None and options.start != "nothing" and self._config.verify.method == "probability":
+            yield AS_PREDICTED
+        if options.start == "prediction" or len(points) < 3:
             return
-        if self._widened_for is not self.map:
-            self._all_triangles = AllTriangles(replace(options, portion=_WIDENED_PORTION))
-            self._all_triangles.learn(self.map, NOTHING)
-            self._widened_for = self.map
-        yield from self._all_triangles.identify(points, self.map)
+        yield from self.identifier.identify(points, self.map, self.motion.newest if self.motion else None)
+        if options.widens:
+            needed = fewest_points(self.index, points, self.map, self._config.verify)
+            yield from any_triangles(points, self.map, self.index, needed, options)
+
+    def _judge(
+        self,
+        evidence: Evidence,
+        identification: Identification,
+        earlier: Sequence[Identification],
+        prediction: Prediction | None,
+        clock: "Stopwatch",
+        asks_dots: bool = False,
+    ) -> Fix | NoFix:
+        """Hypotheses to poses to the one that is proven, by the method that the options name."""
+        options, points = self._config.verify, evidence.points
+        with clock("orient"):
+            orientations = orient(points, self.map, identification, prediction)
+        with clock("verify"):
+            match options.method:
+                case "probability":
+                    scene = evidence, self.map, self.index
+                    return verify(*scene, identification, orientations, earlier, prediction, asks_dots, options)
+                case "residual":
+                    limits = options.counterpart_mm, options.max_residual_mm
+                    return verify_residual(points, self.map, orientations, *limits)
+                case _:
+                    assert_never(options.method)
 
     def learn(
         self,
@@ -123,7 +157,7 @@ class Island:
         self.removed = NOTHING
         self.events = []
         self.follow(frame.timestamp_ns, fix)
-        if self._is_frozen:
+        if self._is_frozen or fix.reason is PositionedReason.few_points:
             self.identifier.learn(self.map, fix.target)
             return NOTHING
         if fix.reason is PositionedReason.defines_world:
@@ -138,7 +172,7 @@ class Island:
             self.removed = before.id[gone[before.id[gone] != np.where(self.map.alive, self.map.id, -1)[gone]]]
             known = before.rows(fix.target)
             self.map, self.events = self._care.tend(known, self.map, added, points, fix, frame, self._hand)
-        self.identifier.learn(self.map, np.unique(np.concatenate([fix.target, added])))
+        self._follow_map(np.unique(np.concatenate([fix.target, added])))
         return added
 
     def in_gauge(self, fix: Fix) -> Fix:
@@ -150,7 +184,8 @@ class Island:
         """
         if fix.reason is PositionedReason.defines_world:
             return fix
-        averaged = 1.0 - 1.0 / np.maximum(self.map.sightings[fix.target], 1).mean()
+        seen = self.map.sightings[np.concatenate([fix.target, fix.single.target])]
+        averaged = 1.0 - 1.0 / np.maximum(seen, 1).mean()
         A = fix.T_world_sensor.inverse().adjoint()
         return replace(fix, cov=fix.cov + averaged * (A @ self._gauge @ A.T))
 
@@ -168,7 +203,9 @@ class Island:
         """Forgets the motion."""
         self.motion = None
 
-    def bridge(self, other: "Island", T_other_sensor: Pose, clock: "Stopwatch") -> Fix | None:
+    def bridge(
+        self, other: "Island", T_other_sensor: Pose, prediction: Prediction | None, clock: "Stopwatch"
+    ) -> Fix | None:
         """The pose here of a sensor whose pose is known there, if all that the other island shows it proves one.
 
         The other island's targets, as the sensor would see them, are a frame like any other, but a better one. The
@@ -177,8 +214,8 @@ class Island:
         rows = other.facing(T_other_sensor)
         if len(self.map) == 0 or len(rows) < 3:
             return None
-        _, fix = self.position(other.seen_from(T_other_sensor, rows), None, None, clock)
-        if isinstance(fix, NoFix):
+        _, fix = self.position(Evidence.of(other.seen_from(T_other_sensor, rows)), prediction, clock)
+        if isinstance(fix, NoFix) or len(fix.point) < 3:
             return None
         return replace(fix, point=np.searchsorted(np.flatnonzero(other.map.alive), rows[fix.point]))
 
@@ -188,8 +225,13 @@ class Island:
         self.map, added = update(self.map, points, None, bridge, frame.index, None, next_id, self._config.update)
         self.frames += other.frames
         other.is_absorbed = True
-        self.identifier.learn(self.map, np.unique(np.concatenate([bridge.target, added])))
+        self._follow_map(np.unique(np.concatenate([bridge.target, added])))
         return len(added)
+
+    def _follow_map(self, seen: Int[np.ndarray, "s"]) -> None:
+        """Index and technique take note of the map as it is now."""
+        self.index.follow(self.map)
+        self.identifier.learn(self.map, seen)
 
     def facing(self, T_world_sensor: Pose) -> Int[np.ndarray, "r"]:
         """Rows of living targets that turn towards the sensor and lie before it."""
@@ -208,25 +250,6 @@ class Island:
             label=np.full(len(rows), -1),
             row=np.arange(len(rows)),
         )
-
-    def _verify(
-        self,
-        points: SensorPoints,
-        matches: StereoMatches | None,
-        identification: Identification,
-        orientations: Orientations,
-        tried: float,
-        prediction: Prediction | None,
-    ) -> Fix | NoFix:
-        """Poses to the one that is proven, by the method that the options name."""
-        options = self._config.verify
-        match options.method:
-            case "probability":
-                return verify(points, self.map, identification, orientations, matches, tried, prediction, options)
-            case "residual":
-                return verify_residual(points, self.map, orientations, options.counterpart_mm, options.max_residual_mm)
-            case _:
-                assert_never(options.method)
 
 
 def _pose_covariance(xyz_mm: Float[np.ndarray, "n 3"], cov_mm2: Float[np.ndarray, "n 3 3"]) -> np.ndarray:

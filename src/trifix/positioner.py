@@ -27,6 +27,7 @@ from trifix.records import (
     Identification,
     NoFix,
     PositionedReason,
+    Prediction,
     Reason,
     ReferenceMap,
     SensorPoints,
@@ -41,6 +42,7 @@ from trifix.stages.identify import Identifier
 from trifix.stages.match import match
 from trifix.stages.triangulate import triangulate
 from trifix.stages.update import distinct, stored
+from trifix.stages.verify import Evidence
 from trifix.stages.weigh import (
     NoiseScale,
     add_prior_noise,
@@ -50,7 +52,8 @@ from trifix.stages.weigh import (
     weigh_residuals,
 )
 
-_COULD_BE_ELSEWHERE = (Reason.no_candidate, Reason.not_proven)
+_HERE_PERHAPS = 1e-3  # no part of the object is new where what is known agrees so well
+_COULD_BE_ELSEWHERE = (Reason.no_candidate, Reason.not_proven, Reason.out_of_time)
 
 
 class Positioner:
@@ -104,6 +107,8 @@ class Positioner:
         """Judges one frame, and lets the map grow by it if it is positioned."""
         if frame.timestamp_ns < self._last_ns:
             frame = _reversed(frame, self._last_ns)
+        elif isinstance(frame.content, SensorPoints):
+            frame = _finite(frame, frame.content)
         self._last_ns = max(self._last_ns, frame.timestamp_ns)
         return self._judge(frame, learns=True)
 
@@ -111,9 +116,10 @@ class Positioner:
         """The loop's body: sense, position, learn."""
         clock, events, added = Stopwatch(), list[Event](), NOTHING
         dots, matches, points = self._sense(frame, clock)
-        island, identification, fix = self._position(frame, points, matches, clock)
+        evidence = None if points is None else Evidence.of(points, matches, dots, frame.rig, self.noise.scale)
+        island, identification, fix = self._position(frame, evidence, clock)
         there: Fix | None = fix if isinstance(fix, Fix) else None
-        if learns and points is not None:
+        if learns and points is not None and evidence is not None:
             if there is not None and island is not None:
                 added = self._learn(frame, points, matches, island, there, clock)
                 events += [Event("target_removed", int(each), "not seen again") for each in island.removed]
@@ -125,9 +131,9 @@ class Positioner:
                 events += self._join_islands(frame, island, there, clock)
                 if island.is_absorbed:  # the island has just become part of the world
                     island = self._world
-                    identification, fix = island.position(points, matches, frame.timestamp_ns, clock)
+                    identification, fix = island.position(evidence, island.predicted(frame.timestamp_ns), clock)
             if isinstance(fix, NoFix) and fix.weak is not None:
-                self._weigh(points, matches, self.map, fix.weak)
+                self._take_weak(frame, points, matches, fix.weak, clock)
         elif there is not None and island is not None:
             island.follow(frame.timestamp_ns, there)
         elsewhere = None
@@ -170,7 +176,7 @@ class Positioner:
                     is_first_guess = self._is_noise_stated and not self.noise.is_known
                     self._sought = starting_scale(content, options.noise) if is_first_guess else self.noise.scale
                     matches = match(content, frame.rig, options.match, self._sought)
-                    if not self.noise.is_known:
+                    if self._epipolar.seen < options.noise.min_samples:
                         self._weigh_pairs(matches)
                 with clock("triangulate"):
                     points = triangulate(content, matches, frame.rig, self.noise.scale)
@@ -183,28 +189,29 @@ class Positioner:
                 assert_never(content)
 
     def _position(
-        self, frame: Frame, points: SensorPoints | None, matches: StereoMatches | None, clock: Stopwatch
+        self, frame: Frame, evidence: Evidence | None, clock: Stopwatch
     ) -> tuple[Island | None, Identification | None, Fix | NoFix]:
         """Where the frame was seen from: in the world, or else on the newest island that proves it."""
-        if points is None:
+        if evidence is None:
             assert isinstance(frame.content, Unusable)
             return None, None, NoFix(frame.content.reason, frame.content.detail)
-        if len(points) < 3:
-            return None, None, NoFix(Reason.too_few_points, f"{len(points)} points.")
+        points = evidence.points
         limit = self.config.identify.max_points
         if len(points) > limit:
             return None, None, NoFix(Reason.out_of_time, f"{len(points)} points, and at most {limit} are searched.")
         if len(self.map) == 0:
             fix = _define_world(points)
             return (self._world if isinstance(fix, Fix) else None), None, fix
-        identification, fix = self._world.position(points, matches, frame.timestamp_ns, clock)
+        identification, fix = self._world.position(evidence, self._world.predicted(frame.timestamp_ns), clock)
         if isinstance(fix, Fix):
             return self._world, identification, fix
         if fix.why in _COULD_BE_ELSEWHERE:
             for island in reversed(self._islands):
-                there, elsewhere = island.position(points, matches, frame.timestamp_ns, clock)
+                there, elsewhere = island.position(evidence, island.predicted(frame.timestamp_ns), clock)
                 if isinstance(elsewhere, Fix):
                     return island, there, elsewhere
+        if len(points) < 3:
+            fix = replace(fix, why=Reason.too_few_points, detail=f"{len(points)} points. {fix.detail}".strip())
         return None, identification, fix
 
     def _learn(
@@ -223,12 +230,26 @@ class Positioner:
             self._next_id += len(added)
         return added
 
+    def _take_weak(
+        self, frame: Frame, points: SensorPoints, matches: StereoMatches | None, fix: Fix, clock: Stopwatch
+    ) -> None:
+        """What can be had from a fix that is too vague to be told: motion and noise, and as long as that is new, a map.
+
+        Before the noise is known, it is taken for larger than it mostly is, and so is the pose's sigma.
+        """
+        if self._epipolar.seen < self.config.noise.min_samples:
+            self._learn(frame, points, matches, self._world, fix, clock)
+        else:
+            self._weigh(points, matches, self.map, fix)
+            self._world.follow(frame.timestamp_ns, fix)
+
     def _may_found(self, points: SensorPoints, fix: Fix | NoFix) -> bool:
         """Whether a frame could belong to a part of the object that no map knows yet."""
         options = self.config.islands
         return (
             isinstance(fix, NoFix)
             and fix.why in _COULD_BE_ELSEWHERE
+            and not fix.p_chance < _HERE_PERHAPS
             and options.max_islands > 0
             and not self._is_map_frozen
             and len(points) >= options.min_points
@@ -240,7 +261,9 @@ class Positioner:
         if len(self._islands) == self.config.islands.max_islands:
             self._islands.remove(min(self._islands, key=lambda island: island.frames))
         self._founded += 1
-        island, first = Island(self._founded, self.config, ReferenceMap.empty()), _define_world(points)
+        link = self._world.predicted(frame.timestamp_ns)
+        island = Island(self._founded, self.config, ReferenceMap.empty(), T_world_island=link)
+        first = _define_world(points)
         assert isinstance(first, Fix), "asked before"
         self._next_id += len(island.learn(frame, points, None, first, self._next_id))
         self._islands.append(island)
@@ -252,10 +275,12 @@ class Positioner:
         for other in [island] if island is not self._world else list(self._islands):
             there: Fix | None = fix
             if island is self._world:  # from where would the island see what the world shows this frame?
-                there = other.bridge(self._world, fix.T_world_sensor, clock)
+                expected = _across(other.T_world_island, fix.T_world_sensor, is_to_world=False)
+                there = other.bridge(self._world, fix.T_world_sensor, expected, clock)
             if there is None:
                 continue
-            bridge = self._world.bridge(other, there.T_world_sensor, clock)
+            expected = _across(other.T_world_island, there.T_world_sensor, is_to_world=True)
+            bridge = self._world.bridge(other, there.T_world_sensor, expected, clock)
             if bridge is None:
                 continue
             new = self._world.absorb(other, there.T_world_sensor, bridge, frame, self._next_id)
@@ -271,7 +296,7 @@ class Positioner:
         options, is_stated = self.config.noise, self._is_noise_stated
         now = weigh_residuals(replace(self._residuals, scale=self.noise.scale), points, map, fix, is_stated, options)
         self._residuals = _newest(self._residuals, now)
-        if matches is not None and fix.reason is not PositionedReason.defines_world:
+        if matches is not None and self._epipolar.seen >= options.min_samples:
             self._weigh_pairs(matches.rows(points.match[fix.point]))
         elif matches is None:
             self._take_noise(self._residuals)
@@ -392,6 +417,8 @@ def position(
 
 def _define_world(points: SensorPoints) -> Fix | NoFix:
     """The first frame is where the world begins, if its points could ever be recognised."""
+    if len(points) < 3:
+        return NoFix(Reason.too_few_points, f"{len(points)} points.")
     if spread_off_line_mm(points.xyz_mm) < 3.0:
         return NoFix(Reason.weak_geometry, "The points lie within 3 mm of one line.")
     rows = distinct(points, np.arange(len(points)))
@@ -410,6 +437,25 @@ def _reversed(frame: Frame, last_ns: int) -> Frame:
     """The same frame, refused because it is older than one already judged."""
     detail = f"It was taken at {frame.timestamp_ns} ns, after one of {last_ns} ns."
     return Frame(frame.index, frame.timestamp_ns, frame.rig, Unusable(Reason.time_reversed, detail))
+
+
+def _finite(frame: Frame, points: SensorPoints) -> Frame:
+    """The same frame, refused where a point is not a number."""
+    bad = ~(np.isfinite(points.xyz_mm).all(axis=1) & np.isfinite(points.cov_mm2).all(axis=(1, 2)))
+    if not bad.any():
+        return frame
+    detail = f"{bad.sum()} of {len(points)} points are not finite, the first in row {points.row[np.argmax(bad)]}."
+    return replace(frame, content=Unusable(Reason.bad_points, detail))
+
+
+def _across(link: Prediction | None, T: Pose, is_to_world: bool) -> Prediction | None:
+    """Where a sensor is in the world whose pose on an island is known, or the other way round."""
+    if link is None:
+        return None
+    T_world_island = link.T_world_sensor
+    there = T_world_island @ T if is_to_world else T_world_island.inverse() @ T
+    A = (T if is_to_world else there).inverse().adjoint()
+    return Prediction(there, A @ link.cov @ A.T)
 
 
 def _newest(before: NoiseScale, now: NoiseScale) -> NoiseScale:

@@ -272,6 +272,8 @@ class Identification:
     """Comparisons of triangles or distances that were made to find them."""
     expected_by_chance: float = float("inf")
     """Hypotheses that chance alone would have brought, by the technique's own estimate; infinite where it has none."""
+    max_sigmas: float = 0.0
+    """Lengths of their triangles agree within so many standard deviations; 0 where nothing is known of that."""
 
     def __len__(self) -> int:
         return len(self.point)
@@ -289,6 +291,8 @@ class Orientations:
     """Covariances of δ = (translation mm, rotation rad), T · exp(δ)."""
     is_valid: Bool[np.ndarray, "h"]
     """False where the pairs lie on one line and determine no pose."""
+    d2: Float[np.ndarray, "h"]
+    """Squared Mahalanobis distances of the pairs at that pose, summed; of three pairs, chi-square of three sides."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

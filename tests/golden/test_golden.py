@@ -10,14 +10,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from constellations import RIG, fixed, front_map
+from constellations import RIG, fixed, front_map, indexed
 from trifix.records import Dots, Identification, ReferenceMap, SensorPoints, StereoDots, StereoMatches
 from trifix.stages.identify import identifier
 from trifix.stages.identify.congruence import IdentifyOptions
 from trifix.stages.match import match
 from trifix.stages.orient import orient
 from trifix.stages.triangulate import triangulate
-from trifix.stages.verify import verify
+from trifix.stages.verify import Evidence, verify
 
 HERE = Path(__file__).parent
 SIGMA_PX = 0.1
@@ -86,14 +86,14 @@ def test_identify(request, hypotheses):
 
 
 def test_verify(request, points, map, hypotheses, matches):
-    fix = fixed(verify(points, map, hypotheses, orient(points, map, hypotheses), matches=matches))
+    fix = fixed(verify(Evidence.of(points, matches), map, indexed(map), hypotheses, orient(points, map, hypotheses)))
     order = np.argsort(fix.target)
     found = np.stack([fix.target[order], fix.point[order], fix.residual_mm[order]], axis=1)
     compare(request, "verify", "target,point,residual_mm", found, 0, 1e-6)
 
 
 def test_pose(request, points, map, hypotheses, matches):
-    fix = fixed(verify(points, map, hypotheses, orient(points, map, hypotheses), matches=matches))
+    fix = fixed(verify(Evidence.of(points, matches), map, indexed(map), hypotheses, orient(points, map, hypotheses)))
     sigma = np.sqrt(np.diag(fix.cov))
     found = np.concatenate([fix.T_world_sensor.t_mm, fix.T_world_sensor.quaternion_xyzw, sigma])
     compare(request, "pose", "x,y,z,qx,qy,qz,qw,six sigmas (mm and rad)", found[None], 1e-6, 1e-9)

@@ -28,6 +28,7 @@ def hypotheses(*poses: Pose) -> Orientations:
         np.array([T.t_mm for T in poses]).reshape(h, 3),
         np.zeros((h, 6, 6)),
         np.ones(h, dtype=np.bool_),
+        np.zeros(h),
     )
 
 

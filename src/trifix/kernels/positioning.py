@@ -10,8 +10,17 @@ from numba import njit
 CLUTTER_SHARES = np.array([0.1, 0.3, 0.5, 0.7, 0.9])
 """Shares of a frame's points that are clutter; a hypothesis is weighed under each of them, see ``grow``."""
 
-TARGETS_AROUND = 2.5
-"""κ: a normal density of the spread of five neighbours stands for this many targets (five on a disc: 2π · 5/4π)."""
+MISS_RATES = np.array([0.02, 0.1, 0.3, 0.6, 0.9])
+"""Shares of the targets in view that a frame may fail to see."""
+
+MISS_WEIGHTS = np.array([0.4, 0.3, 0.2, 0.07, 0.03])
+"""How common frames of each miss rate are taken to be: mostly nothing is hidden, seldom nearly everything."""
+
+_FIRST_ASKED = 8
+"""Neighbours that a hypothesis is asked for first: if none of them has a target where it should, no more are asked."""
+
+SURROUNDING = 5
+"""Neighbours of a target that tell how targets lie around it."""
 
 
 # --- triangles -------------------------------------------------------------------------------------------------------
@@ -114,33 +123,6 @@ def describe_triangles(xyz, cov, towards_sensor, triangles, min_sine):
 @njit(cache=True, nogil=True)
 def _bucket(i, j, k, mask):
     return ((i * 73856093) ^ (j * 19349663) ^ (k * 83492791)) & mask
-
-
-@njit(cache=True, nogil=True)
-def build_grid(xyz, rows, cell_mm):
-    """Hashed cells over some rows of ``xyz``: (start of each bucket, rows in bucket order)."""
-    size = 16
-    while size < 2 * len(rows):
-        size *= 2
-    start = np.zeros(size + 1, np.int64)
-    key = np.empty(len(rows), np.int64)
-    for n in range(len(rows)):
-        r = rows[n]
-        key[n] = _bucket(
-            int(np.floor(xyz[r, 0] / cell_mm)),
-            int(np.floor(xyz[r, 1] / cell_mm)),
-            int(np.floor(xyz[r, 2] / cell_mm)),
-            size - 1,
-        )
-        start[key[n] + 1] += 1
-    for b in range(size):
-        start[b + 1] += start[b]
-    place = start[:-1].copy()
-    item = np.empty(len(rows), np.int64)
-    for n in range(len(rows)):
-        item[place[key[n]]] = rows[n]
-        place[key[n]] += 1
-    return start, item
 
 
 # --- small closed forms ----------------------------------------------------------------------------------------------
@@ -269,7 +251,7 @@ def _innovation_frame(R, cov_point, cov_target, S):
 
 @njit(cache=True, nogil=True)
 def orient_triangles(xyz, cov, points, target_xyz, target_cov, targets):
-    """Weighted absolute orientation of h three-point hypotheses: (R (h,3,3), t (h,3), P (h,6,6), ok (h)).
+    """Weighted absolute orientation of h three-point hypotheses: (R (h,3,3), t (h,3), P (h,6,6), ok (h), d² (h)).
 
     The pose that lays one triangle's axes on the other's is the start of two Gauss-Newton steps on the Mahalanobis
     distances of the three pairs; P is the inverse of their normal matrix.
@@ -279,6 +261,7 @@ def orient_triangles(xyz, cov, points, target_xyz, target_cov, targets):
     t_out = np.empty((h, 3))
     P_out = np.empty((h, 6, 6))
     ok = np.zeros(h, np.bool_)
+    d2 = np.full(h, np.nan)
     F = np.empty((3, 3))
     W = np.empty((3, 3))
     S = np.empty((3, 3))
@@ -337,7 +320,15 @@ def orient_triangles(xyz, cov, points, target_xyz, target_cov, targets):
         if not good:
             continue
         R_out[i], t_out[i], P_out[i], ok[i] = R, t, P, True
-    return R_out, t_out, P_out, ok
+        d2[i] = 0.0
+        for v in range(3):
+            p, q = points[i, v], targets[i, v]
+            _innovation_frame(R, cov[p], target_cov[q], S)
+            _inverse3(S, G)
+            _residual_jacobian(R, t, xyz[p], target_xyz[q], J, delta)
+            for r in range(3):
+                d2[i] += delta[r] * (G[r, 0] * delta[0] + G[r, 1] * delta[1] + G[r, 2] * delta[2])
+    return R_out, t_out, P_out, ok, d2
 
 
 @njit(cache=True, nogil=True)
@@ -354,56 +345,149 @@ def _residual_jacobian(R, t, point, target, J, residual):
 
 
 # --- growing a hypothesis --------------------------------------------------------------------------------------------
+#
+# The arguments come in groups: ``frame`` is (xyz, cov, left, right) of the points and the dots that they are made of,
+# -1 for none; ``scene`` is (xyz, cov, view, state, sightings, misses, neighbour) of the targets; ``grid`` holds the
+# hashed cells of the map's index, (head of each bucket, next in it, position under which a target is filed, width of a
+# cell, how far a target may be from that position).
 
 
 @njit(cache=True, nogil=True)
-def grow(
-    R,
-    t,
-    P,
-    sequence,
-    xyz,
-    cov,
-    left,
-    right,
-    used_left,
-    used_right,
-    target_xyz,
-    target_cov,
-    target_view,
-    target_spread,
-    used_target,
-    start,
-    item,
-    cell_mm,
-    gate,
-    matched,
-    log_ratio,
-):
+def _lever(P, p, PJ):
+    """P Jᵀ (6, 3) with J = [I, −[p]×]: how the pose's error moves a point."""
+    for a in range(6):
+        PJ[a, 0] = P[a, 0] + P[a, 4] * p[2] - P[a, 5] * p[1]
+        PJ[a, 1] = P[a, 1] - P[a, 3] * p[2] + P[a, 5] * p[0]
+        PJ[a, 2] = P[a, 2] + P[a, 3] * p[1] - P[a, 4] * p[0]
+
+
+@njit(cache=True, nogil=True)
+def _predicted_covariance(PJ, p, C, B):
+    """B = C + J P Jᵀ."""
+    for c in range(3):
+        B[0, c] = C[0, c] + PJ[0, c] + p[2] * PJ[4, c] - p[1] * PJ[5, c]
+        B[1, c] = C[1, c] + PJ[1, c] - p[2] * PJ[3, c] + p[0] * PJ[5, c]
+        B[2, c] = C[2, c] + PJ[2, c] + p[1] * PJ[3, c] - p[0] * PJ[4, c]
+
+
+@njit(cache=True, nogil=True)
+def _surroundings(q, xyz, neighbour, cell_mm, out):
+    """Mean square offsets of the nearest neighbours of a target into ``out``; returns (their number, spacing mm).
+
+    A target without neighbours within the reach of the index, four cells, has one there for all we know.
+    """
+    out[:] = 0.0
+    count = 0
+    farthest2 = 0.0
+    for i in range(SURROUNDING):
+        w = neighbour[q, i]
+        if w < 0:
+            break
+        count += 1
+        d0, d1, d2 = xyz[w, 0] - xyz[q, 0], xyz[w, 1] - xyz[q, 1], xyz[w, 2] - xyz[q, 2]
+        out[0, 0] += d0 * d0
+        out[0, 1] += d0 * d1
+        out[0, 2] += d0 * d2
+        out[1, 1] += d1 * d1
+        out[1, 2] += d1 * d2
+        out[2, 2] += d2 * d2
+        farthest2 = max(farthest2, d0 * d0 + d1 * d1 + d2 * d2)
+    if count == 0:
+        for r in range(3):
+            out[r, r] = 16 * cell_mm * cell_mm
+        return 1, 4 * cell_mm
+    for r in range(3):
+        for c in range(r, 3):
+            out[r, c] /= count
+            out[c, r] = out[r, c]
+    return count, np.sqrt(farthest2 * np.pi / count)
+
+
+@njit(cache=True, nogil=True)
+def _find_target(x, R, t, B, reach, gate, scene, grid, S, G):
+    """The target nearest to a predicted point: (its row or -1, squared Mahalanobis distance, that of the second)."""
+    xyz, cov, view = scene[0], scene[1], scene[2]
+    head, following, anchor, cell_mm = grid[0], grid[1], grid[2], grid[3]
+    mask = len(head) - 1
+    best = -1
+    best_d2 = second_d2 = 1e300
+    e0 = e1 = e2 = 0.0
+    i0, i1 = int(np.floor((x[0] - reach) / cell_mm)), int(np.floor((x[0] + reach) / cell_mm))
+    j0, j1 = int(np.floor((x[1] - reach) / cell_mm)), int(np.floor((x[1] + reach) / cell_mm))
+    k0, k1 = int(np.floor((x[2] - reach) / cell_mm)), int(np.floor((x[2] + reach) / cell_mm))
+    for i in range(i0, i1 + 1):
+        for j in range(j0, j1 + 1):
+            for k in range(k0, k1 + 1):
+                q = head[_bucket(i, j, k, mask)]
+                while q >= 0:
+                    here = q
+                    q = following[q]
+                    d0, d1, d2 = xyz[here, 0] - x[0], xyz[here, 1] - x[1], xyz[here, 2] - x[2]
+                    if d0 * d0 + d1 * d1 + d2 * d2 > reach * reach:
+                        continue
+                    if (
+                        int(np.floor(np.float64(anchor[here, 0]) / cell_mm)) != i
+                        or int(np.floor(np.float64(anchor[here, 1]) / cell_mm)) != j
+                        or int(np.floor(np.float64(anchor[here, 2]) / cell_mm)) != k
+                    ):
+                        continue
+                    # a target is not seen from behind
+                    s0, s1, s2 = t[0] - xyz[here, 0], t[1] - xyz[here, 1], t[2] - xyz[here, 2]
+                    if view[here, 0] * s0 + view[here, 1] * s1 + view[here, 2] * s2 < 0:
+                        continue
+                    _innovation_frame(R, B, cov[here], S)
+                    if _inverse3(S, G) <= 0.0:
+                        continue
+                    e0 = R[0, 0] * d0 + R[1, 0] * d1 + R[2, 0] * d2
+                    e1 = R[0, 1] * d0 + R[1, 1] * d1 + R[2, 1] * d2
+                    e2 = R[0, 2] * d0 + R[1, 2] * d1 + R[2, 2] * d2
+                    m2 = (
+                        G[0, 0] * e0 * e0
+                        + G[1, 1] * e1 * e1
+                        + G[2, 2] * e2 * e2
+                        + 2 * (G[0, 1] * e0 * e1 + G[0, 2] * e0 * e2 + G[1, 2] * e1 * e2)
+                    )
+                    if m2 > gate * gate:
+                        continue
+                    if m2 < best_d2:
+                        second_d2 = best_d2
+                        best, best_d2 = here, m2
+                    elif m2 < second_d2:
+                        second_d2 = m2
+    return best, best_d2, second_d2
+
+
+@njit(cache=True, nogil=True)
+def _rarity(R, S, q, scene, cell_mm, Q, D):
+    """N(0; S) / q: how much denser an expected target is at its own place than targets around it are; D is scratch."""
+    count, _ = _surroundings(q, scene[0], scene[6], cell_mm, D)
+    _innovation_frame(R, S, D, Q)
+    return np.sqrt(_determinant3(Q) / _determinant3(S)) / (0.5 * count)
+
+
+@njit(cache=True, nogil=True)
+def grow(R, t, P, sequence, frame, used, scene, used_target, grid, gate, matched, log_ratio):
     """Takes the points of ``sequence`` in turn, predicts each from all before it, and weighs the agreement.
 
     R, t, P (the pose and its covariance) are sharpened in place by each point that finds its target: a Kalman filter.
     ``matched`` (n) receives the row of the target of each point, -1 for none, -2 for a point that was passed over
-    because its prediction was still too vague, or because two targets competed for it.
+    because its prediction was still too vague, or because two targets competed for it. ``used`` marks dots, left and
+    right, that belong to a point already, and ``used_target`` targets.
 
     ``log_ratio`` (one entry a clutter share c) gains ln(c + (1 − c) · N(r; S) / q) for a point with a target at
     residual r, and ln c for one without: the likelihood of the point if the pose is right, against that of a point that
-    falls by chance where targets are. q = κ N(0; S + Σ) is the density of targets around that one, with Σ the
-    ``target_spread`` of its neighbours: where they lie in a plane, lying in it is no evidence. Each point is predicted
-    from points before it only; its factor therefore has mean ≤ 1 if the pose is wrong, and so has the product.
+    falls by chance where targets are. q = κ N(0; S + Σ) is the density of targets around that one, with Σ the mean
+    square offsets of its m neighbours and κ = m/2, which is right for a disc evenly filled: where targets lie in a
+    plane, lying in it is no evidence. Each point is predicted from points before it only; its factor therefore has
+    mean ≤ 1 if the pose is wrong, and so has the product. Returns the number of points that found a target.
     """
-    S = np.empty((3, 3))
-    G = np.empty((3, 3))
-    Q = np.empty((3, 3))
-    B = np.empty((3, 3))
-    J = np.empty((3, 6))
-    PJ = np.empty((6, 3))
-    K = np.empty((6, 3))
-    e = np.empty(3)
-    delta = np.empty(6)
-    x = np.empty(3)
+    xyz, cov, left, right = frame
+    used_left, used_right = used
+    cell_mm, slack_mm = grid[3], grid[4]
+    S, G, Q, B, D = np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3))
+    PJ, K = np.empty((6, 3)), np.empty((6, 3))
+    e, x, delta = np.empty(3), np.empty(3), np.empty(6)
     shares = CLUTTER_SHARES
-    mask = len(start) - 2
     found = 0
     for n in sequence:
         if (left[n] >= 0 and used_left[left[n]]) or (right[n] >= 0 and used_right[right[n]]):
@@ -412,74 +496,14 @@ def grow(
         p = xyz[n]
         for r in range(3):
             x[r] = R[r, 0] * p[0] + R[r, 1] * p[1] + R[r, 2] * p[2] + t[r]
-        # covariance of the prediction, without the target's own
-        J[:] = 0.0
-        J[0, 0] = J[1, 1] = J[2, 2] = 1.0
-        J[0, 4], J[0, 5] = p[2], -p[1]
-        J[1, 3], J[1, 5] = -p[2], p[0]
-        J[2, 3], J[2, 4] = p[1], -p[0]
-        for a in range(6):
-            for r in range(3):
-                s = 0.0
-                for b in range(6):
-                    s += P[a, b] * J[r, b]
-                PJ[a, r] = s
-        for r in range(3):
-            for c in range(3):
-                s = cov[n, r, c]
-                for a in range(6):
-                    s += J[r, a] * PJ[a, c]
-                B[r, c] = s
+        _lever(P, p, PJ)
+        _predicted_covariance(PJ, p, cov[n], B)
         reach = gate * np.sqrt(B[0, 0] + B[1, 1] + B[2, 2])
-        if reach > 2.0 * cell_mm:
+        if not reach <= 2.0 * cell_mm:
             matched[n] = -2
             continue
-        reach = max(reach, 0.05 * cell_mm) + 0.25 * cell_mm  # and some for the targets' own covariance
-        best = -1
-        best_d2 = 1e300
-        best_ratio = 0.0
-        second_d2 = 1e300
-        i0, i1 = int(np.floor((x[0] - reach) / cell_mm)), int(np.floor((x[0] + reach) / cell_mm))
-        j0, j1 = int(np.floor((x[1] - reach) / cell_mm)), int(np.floor((x[1] + reach) / cell_mm))
-        k0, k1 = int(np.floor((x[2] - reach) / cell_mm)), int(np.floor((x[2] + reach) / cell_mm))
-        for i in range(i0, i1 + 1):
-            for j in range(j0, j1 + 1):
-                for k in range(k0, k1 + 1):
-                    b = _bucket(i, j, k, mask)
-                    for m in range(start[b], start[b + 1]):
-                        q = item[m]
-                        y0, y1, y2 = target_xyz[q, 0], target_xyz[q, 1], target_xyz[q, 2]
-                        if (
-                            int(np.floor(y0 / cell_mm)) != i
-                            or int(np.floor(y1 / cell_mm)) != j
-                            or int(np.floor(y2 / cell_mm)) != k
-                        ):
-                            continue
-                        d0, d1, d2 = y0 - x[0], y1 - x[1], y2 - x[2]
-                        if d0 * d0 + d1 * d1 + d2 * d2 > reach * reach:
-                            continue
-                        # a target is not seen from behind
-                        s0, s1, s2 = t[0] - y0, t[1] - y1, t[2] - y2
-                        if target_view[q, 0] * s0 + target_view[q, 1] * s1 + target_view[q, 2] * s2 < 0:
-                            continue
-                        _innovation_frame(R, B, target_cov[q], S)
-                        if _inverse3(S, G) <= 0.0:
-                            continue
-                        for r in range(3):
-                            e[r] = R[0, r] * d0 + R[1, r] * d1 + R[2, r] * d2
-                        m2 = 0.0
-                        for r in range(3):
-                            for c in range(3):
-                                m2 += e[r] * G[r, c] * e[c]
-                        if m2 > gate * gate:
-                            continue
-                        if m2 < best_d2:
-                            second_d2 = best_d2
-                            best, best_d2 = q, m2
-                            _innovation_frame(R, S, target_spread[q], Q)
-                            best_ratio = np.sqrt(_determinant3(Q) / _determinant3(S)) / TARGETS_AROUND
-                        elif m2 < second_d2:
-                            second_d2 = m2
+        reach += 0.25 * cell_mm + slack_mm  # for the targets' own covariance, and for how they are filed
+        best, best_d2, second_d2 = _find_target(x, R, t, B, reach, gate, scene, grid, S, G)
         if best >= 0 and second_d2 - best_d2 < 6.0:
             matched[n] = -2  # E holds points with exactly one counterpart (Khoury 2006, eq. 1-4)
             continue
@@ -488,7 +512,8 @@ def grow(
             for c in range(len(shares)):
                 log_ratio[c] += np.log(shares[c])
             continue
-        peak = np.exp(-0.5 * best_d2) * best_ratio
+        _innovation_frame(R, B, scene[1][best], S)
+        peak = np.exp(-0.5 * best_d2) * _rarity(R, S, best, scene, cell_mm, Q, D)
         for c in range(len(shares)):
             log_ratio[c] += np.log(shares[c] + (1.0 - shares[c]) * peak)
         matched[n] = best
@@ -500,11 +525,10 @@ def grow(
         found += 1
 
         # Kalman update of the pose by this pair
-        _innovation_frame(R, B, target_cov[best], S)
         _inverse3(S, G)
-        d0, d1, d2 = target_xyz[best, 0] - x[0], target_xyz[best, 1] - x[1], target_xyz[best, 2] - x[2]
+        y = scene[0][best]
         for r in range(3):
-            e[r] = R[0, r] * d0 + R[1, r] * d1 + R[2, r] * d2
+            e[r] = R[0, r] * (y[0] - x[0]) + R[1, r] * (y[1] - x[1]) + R[2, r] * (y[2] - x[2])
         for a in range(6):
             for r in range(3):
                 K[a, r] = PJ[a, 0] * G[0, r] + PJ[a, 1] * G[1, r] + PJ[a, 2] * G[2, r]
@@ -517,115 +541,611 @@ def grow(
 
 
 @njit(cache=True, nogil=True)
-def score_hypotheses(
+def _in_camera(R, t, y, cam_R, cam_t, p, h, A):
+    """Slopes ``h`` of a target in a camera, and A = dh/dp with p the target in sensor coordinates; False behind it."""
+    for r in range(3):
+        p[r] = R[0, r] * (y[0] - t[0]) + R[1, r] * (y[1] - t[1]) + R[2, r] * (y[2] - t[2])
+    X = cam_R[0, 0] * p[0] + cam_R[0, 1] * p[1] + cam_R[0, 2] * p[2] + cam_t[0]
+    Y = cam_R[1, 0] * p[0] + cam_R[1, 1] * p[1] + cam_R[1, 2] * p[2] + cam_t[1]
+    Z = cam_R[2, 0] * p[0] + cam_R[2, 1] * p[1] + cam_R[2, 2] * p[2] + cam_t[2]
+    if Z <= 1.0:
+        return False
+    h[0], h[1] = X / Z, Y / Z
+    for c in range(3):
+        A[0, c] = (cam_R[0, c] - h[0] * cam_R[2, c]) / Z
+        A[1, c] = (cam_R[1, c] - h[1] * cam_R[2, c]) / Z
+    return True
+
+
+@njit(cache=True, nogil=True)
+def _add_seen_covariance(A, C, out):
+    """out (2, 2) += A C Aᵀ."""
+    for r in range(2):
+        for c in range(2):
+            s = 0.0
+            for i in range(3):
+                for j in range(3):
+                    s += A[r, i] * C[i, j] * A[c, j]
+            out[r, c] += s
+
+
+@njit(cache=True, nogil=True)
+def grow_by_dots(R, t, P, dots, used, cams, scene, used_target, alive, cell_mm, gate, dot_target, log_ratio):
+    """The same as ``grow`` with dots that no point has claimed: two equations each against a known target.
+
+    ``dots`` is (camera, row in that camera, slopes, covariance of the slopes), ``cams`` the rotations and translations
+    of both cameras, ``alive`` the rows of the targets that may be seen. Evidence counts as in ``grow``, in the image.
+    Those that are too vague wait until others have sharpened the pose. Returns the number that found a target.
+    """
+    camera, row, xy, cov = dots
+    cam_R, cam_t = cams
+    d = len(camera)
+    PJ, AP, K = np.empty((6, 3)), np.empty((6, 2)), np.empty((6, 2))
+    S, U, V = np.empty((2, 2)), np.empty((2, 2)), np.empty((2, 2))
+    B, D, W = np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3))
+    zero = np.zeros((3, 3))
+    p, h, A = np.empty(3), np.empty(2), np.empty((2, 3))
+    delta = np.empty(6)
+    shares = CLUTTER_SHARES
+    found = 0
+    for turn in range(3):
+        for n in range(d):
+            if dot_target[n] >= 0 or (turn > 0 and dot_target[n] == -1):
+                continue
+            if used[camera[n]][row[n]]:
+                dot_target[n] = -1
+                continue
+            m = camera[n]
+            best, best_d2, second_d2 = -1, 1e300, 1e300
+            for q in alive:
+                if used_target[q]:
+                    continue
+                s0, s1, s2 = t[0] - scene[0][q, 0], t[1] - scene[0][q, 1], t[2] - scene[0][q, 2]
+                if scene[2][q, 0] * s0 + scene[2][q, 1] * s1 + scene[2][q, 2] * s2 < 0:
+                    continue
+                if not _in_camera(R, t, scene[0][q], cam_R[m], cam_t[m], p, h, A):
+                    continue
+                e0, e1 = h[0] - xy[n, 0], h[1] - xy[n, 1]
+                if e0 * e0 + e1 * e1 > 0.01:  # a tenth of the depth to the side
+                    continue
+                _lever(P, p, PJ)
+                _innovation_frame(R, zero, scene[1][q], D)
+                _predicted_covariance(PJ, p, D, B)
+                S[:] = cov[n]
+                _add_seen_covariance(A, B, S)
+                det = S[0, 0] * S[1, 1] - S[0, 1] * S[1, 0]
+                m2 = (S[1, 1] * e0 * e0 - 2 * S[0, 1] * e0 * e1 + S[0, 0] * e1 * e1) / det
+                if m2 > gate * gate:
+                    continue
+                if m2 < best_d2:
+                    second_d2 = best_d2
+                    best, best_d2 = q, m2
+                elif m2 < second_d2:
+                    second_d2 = m2
+            if best >= 0 and second_d2 - best_d2 < 6.0:
+                dot_target[n] = -2
+                continue
+            if best < 0:
+                dot_target[n] = -1
+                for c in range(len(shares)):
+                    log_ratio[c] += np.log(shares[c])
+                continue
+            _in_camera(R, t, scene[0][best], cam_R[m], cam_t[m], p, h, A)
+            e0, e1 = h[0] - xy[n, 0], h[1] - xy[n, 1]
+            _lever(P, p, PJ)
+            _innovation_frame(R, zero, scene[1][best], D)
+            _predicted_covariance(PJ, p, D, B)
+            S[:] = cov[n]
+            _add_seen_covariance(A, B, S)
+            det = S[0, 0] * S[1, 1] - S[0, 1] * S[1, 0]
+            count, _ = _surroundings(best, scene[0], scene[6], cell_mm, D)
+            _innovation_frame(R, zero, D, W)
+            U[:] = S
+            _add_seen_covariance(A, W, U)
+            around = U[0, 0] * U[1, 1] - U[0, 1] * U[1, 0]
+            peak = np.exp(-0.5 * best_d2) * np.sqrt(around / det) / (0.5 * count)
+            for c in range(len(shares)):
+                log_ratio[c] += np.log(shares[c] + (1.0 - shares[c]) * peak)
+            dot_target[n] = best
+            used_target[best] = True
+            used[m][row[n]] = True
+            found += 1
+
+            V[0, 0], V[1, 1], V[0, 1], V[1, 0] = S[1, 1] / det, S[0, 0] / det, -S[0, 1] / det, -S[0, 1] / det
+            for a in range(6):
+                for r in range(2):
+                    AP[a, r] = PJ[a, 0] * A[r, 0] + PJ[a, 1] * A[r, 1] + PJ[a, 2] * A[r, 2]
+            for a in range(6):
+                for r in range(2):
+                    K[a, r] = AP[a, 0] * V[0, r] + AP[a, 1] * V[1, r]
+                delta[a] = K[a, 0] * e0 + K[a, 1] * e1
+            for a in range(6):
+                for b in range(6):
+                    P[a, b] -= K[a, 0] * AP[b, 0] + K[a, 1] * AP[b, 1]
+            _move(R, t, delta)
+    return found
+
+
+@njit(cache=True, nogil=True)
+def _refine(R, t, P, frame, scene, matched, dots, cams, dot_target, prior, gate, d2, residual_mm, dot_residual):
+    """The pose from all pairs at once, by Gauss-Newton on their Mahalanobis distances; False where they determine none.
+
+    Pairs beyond the gate are let go. ``prior`` is a pose with its information, zero for none. P receives the
+    covariance, ``d2`` (n) and ``residual_mm`` (n) what is left of each pair, ``dot_residual`` (d) the same in slopes.
+    """
+    xyz, cov = frame[0], frame[1]
+    camera, xy, dot_cov = dots[0], dots[2], dots[3]
+    prior_R, prior_t, prior_info = prior
+    S, G, B = np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3))
+    A, g, delta = np.empty((6, 6)), np.empty(6), np.empty(6)
+    J, GJ, e = np.zeros((3, 6)), np.empty((3, 6)), np.empty(3)
+    p, h, H, U = np.empty(3), np.empty(2), np.empty((2, 3)), np.empty((2, 2))
+    HJ, zero = np.empty((2, 6)), np.zeros((3, 3))
+    for _ in range(3):
+        for _ in range(6):
+            A[:] = prior_info
+            for r in range(3):
+                e[r] = (
+                    prior_R[0, r] * (prior_t[0] - t[0])
+                    + prior_R[1, r] * (prior_t[1] - t[1])
+                    + prior_R[2, r] * (prior_t[2] - t[2])
+                )
+            # log(T⁻¹ T_prior), for small angles
+            w0 = w1 = w2 = 0.0
+            for k in range(3):
+                w0 += 0.5 * (R[k, 2] * prior_R[k, 1] - R[k, 1] * prior_R[k, 2])
+                w1 += 0.5 * (R[k, 0] * prior_R[k, 2] - R[k, 2] * prior_R[k, 0])
+                w2 += 0.5 * (R[k, 1] * prior_R[k, 0] - R[k, 0] * prior_R[k, 1])
+            for a in range(6):
+                g[a] = (
+                    prior_info[a, 0] * e[0]
+                    + prior_info[a, 1] * e[1]
+                    + prior_info[a, 2] * e[2]
+                    + prior_info[a, 3] * w0
+                    + prior_info[a, 4] * w1
+                    + prior_info[a, 5] * w2
+                )
+            for n in range(len(xyz)):
+                q = matched[n]
+                if q < 0:
+                    continue
+                _innovation_frame(R, cov[n], scene[1][q], S)
+                if _inverse3(S, G) <= 0.0:
+                    return False
+                _residual_jacobian(R, t, xyz[n], scene[0][q], J, e)
+                for r in range(3):
+                    for a in range(6):
+                        GJ[r, a] = G[r, 0] * J[0, a] + G[r, 1] * J[1, a] + G[r, 2] * J[2, a]
+                for a in range(6):
+                    for b in range(a, 6):
+                        A[a, b] += J[0, a] * GJ[0, b] + J[1, a] * GJ[1, b] + J[2, a] * GJ[2, b]
+                    g[a] += GJ[0, a] * e[0] + GJ[1, a] * e[1] + GJ[2, a] * e[2]
+            for n in range(len(camera)):
+                q = dot_target[n]
+                if q < 0:
+                    continue
+                if not _in_camera(R, t, scene[0][q], cams[0][camera[n]], cams[1][camera[n]], p, h, H):
+                    return False
+                _innovation_frame(R, zero, scene[1][q], B)
+                U[:] = dot_cov[n]
+                _add_seen_covariance(H, B, U)
+                det = U[0, 0] * U[1, 1] - U[0, 1] * U[1, 0]
+                u, v, w = U[1, 1] / det, -U[0, 1] / det, U[0, 0] / det
+                _residual_jacobian(R, t, p, scene[0][q], J, e)
+                for r in range(2):
+                    for a in range(6):
+                        HJ[r, a] = H[r, 0] * J[0, a] + H[r, 1] * J[1, a] + H[r, 2] * J[2, a]
+                e0, e1 = h[0] - xy[n, 0], h[1] - xy[n, 1]
+                for a in range(6):
+                    f0, f1 = u * HJ[0, a] + v * HJ[1, a], v * HJ[0, a] + w * HJ[1, a]
+                    for b in range(a, 6):
+                        A[a, b] += f0 * HJ[0, b] + f1 * HJ[1, b]
+                    g[a] += f0 * e0 + f1 * e1
+            for a in range(6):
+                for b in range(a):
+                    A[a, b] = A[b, a]
+            if not _inverse6(A, P):
+                return False
+            largest = 0.0
+            for a in range(6):
+                s = 0.0
+                for b in range(6):
+                    s += P[a, b] * g[b]
+                delta[a] = s
+                largest = max(largest, abs(s))
+            _move(R, t, delta)
+            if largest < 1e-8:
+                break
+        dropped = False
+        for n in range(len(xyz)):
+            q = matched[n]
+            d2[n] = residual_mm[n] = np.nan
+            if q < 0:
+                continue
+            _innovation_frame(R, cov[n], scene[1][q], S)
+            _inverse3(S, G)
+            _residual_jacobian(R, t, xyz[n], scene[0][q], J, e)
+            s = 0.0
+            for r in range(3):
+                s += e[r] * (G[r, 0] * e[0] + G[r, 1] * e[1] + G[r, 2] * e[2])
+            d2[n], residual_mm[n] = s, np.sqrt(e[0] ** 2 + e[1] ** 2 + e[2] ** 2)
+            if s > gate * gate:
+                matched[n], dropped = -1, True
+        for n in range(len(camera)):
+            q = dot_target[n]
+            if q < 0:
+                continue
+            _in_camera(R, t, scene[0][q], cams[0][camera[n]], cams[1][camera[n]], p, h, H)
+            _innovation_frame(R, zero, scene[1][q], B)
+            U[:] = dot_cov[n]
+            _add_seen_covariance(H, B, U)
+            e0, e1 = h[0] - xy[n, 0], h[1] - xy[n, 1]
+            det = U[0, 0] * U[1, 1] - U[0, 1] * U[1, 0]
+            dot_residual[n] = np.sqrt(e0 * e0 + e1 * e1)
+            if (U[1, 1] * e0 * e0 - 2 * U[0, 1] * e0 * e1 + U[0, 0] * e1 * e1) / det > gate * gate:
+                dot_target[n], dropped = -1, True
+        if not dropped:
+            return True
+    return True
+
+
+@njit(cache=True, nogil=True)
+def _likelihood(R, frame, scene, matched, d2, cell_mm, log_ratio):
+    """ln of the likelihood of all points at one pose, against chance, a clutter share each: to compare poses by."""
+    S, Q, D = np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3))
+    shares = CLUTTER_SHARES
+    log_ratio[:] = 0.0
+    for n in range(len(matched)):
+        peak = 0.0
+        if matched[n] >= 0:
+            _innovation_frame(R, frame[1][n], scene[1][matched[n]], S)
+            peak = np.exp(-0.5 * d2[n]) * _rarity(R, S, matched[n], scene, cell_mm, Q, D)
+        elif matched[n] == -3:
+            continue
+        for c in range(len(shares)):
+            log_ratio[c] += np.log(shares[c] + (1.0 - shares[c]) * peak)
+
+
+@njit(cache=True, nogil=True)
+def _log_missed(R, t, frame, scene, matched, dot_target, windows, near_mm, is_marked):
+    """ln of the probability that so many of the targets in view are seen as are: a factor ≤ 1 of the likelihood.
+
+    Asked are the matched targets and their neighbours, as far as they are trusted, face the sensor and lie in every
+    window (R, t, limits of slopes and depth) in which a target must be seen. A target that is often missed tells
+    little; one with some point near its place may have been seen.
+    """
+    window_R, window_t, limits = windows
+    rates = MISS_RATES
+    log_p = np.log(MISS_WEIGHTS)
+    if len(limits) == 0:
+        return 0.0
+    xyz, view, state, sightings, misses, neighbour = scene[0], scene[2], scene[3], scene[4], scene[5], scene[6]
+    points = frame[0]
+    asked = np.empty((len(matched) + len(dot_target)) * (1 + neighbour.shape[1]), np.int64)
+    count = seen = 0
+    for n in range(len(matched) + len(dot_target)):
+        q = matched[n] if n < len(matched) else dot_target[n - len(matched)]
+        if q >= 0:
+            is_marked[q] = True
+            asked[count] = q
+            count += 1
+    seen = count
+    for i in range(seen):
+        for w in neighbour[asked[i]]:
+            if w >= 0 and not is_marked[w]:
+                is_marked[w] = True
+                asked[count] = w
+                count += 1
+    x = np.empty(3)
+    for i in range(count):
+        q = asked[i]
+        is_marked[q] = False
+        own = (misses[q] + 0.2) / (misses[q] + sightings[q] + 2.0)
+        if i < seen:
+            for m in range(len(rates)):
+                log_p[m] += np.log(1 - max(rates[m], own))
+            continue
+        if state[q] != 1:
+            continue
+        s0, s1, s2 = t[0] - xyz[q, 0], t[1] - xyz[q, 1], t[2] - xyz[q, 2]
+        facing = view[q, 0] * s0 + view[q, 1] * s1 + view[q, 2] * s2
+        if not facing > 0.5 * np.sqrt(s0 * s0 + s1 * s1 + s2 * s2):  # False where the direction is unknown
+            continue
+        for r in range(3):
+            x[r] = -(R[0, r] * s0 + R[1, r] * s1 + R[2, r] * s2)
+        is_in_view = True
+        for b in range(len(limits)):
+            W, v = window_R[b], window_t[b]
+            X = W[0, 0] * x[0] + W[0, 1] * x[1] + W[0, 2] * x[2] + v[0]
+            Y = W[1, 0] * x[0] + W[1, 1] * x[1] + W[1, 2] * x[2] + v[1]
+            Z = W[2, 0] * x[0] + W[2, 1] * x[1] + W[2, 2] * x[2] + v[2]
+            is_in_view &= (
+                limits[b, 4] < Z
+                and limits[b, 5] > Z
+                and limits[b, 0] * Z < X
+                and limits[b, 1] * Z > X
+                and limits[b, 2] * Z < Y
+                and limits[b, 3] * Z > Y
+            )
+        if not is_in_view:
+            continue
+        for n in range(len(points)):
+            if (points[n, 0] - x[0]) ** 2 + (points[n, 1] - x[1]) ** 2 + (points[n, 2] - x[2]) ** 2 < near_mm**2:
+                is_in_view = False
+                break
+        if is_in_view:
+            for m in range(len(rates)):
+                log_p[m] += np.log(max(rates[m], own))
+    top = log_p.max()
+    return top + np.log(np.exp(log_p - top).sum())
+
+
+@njit(cache=True, nogil=True)
+def _look(h, R, t, P, point, target, near, frame, used, scene, used_target, grid, gate, matched, stamp, log_ratio):
+    """A first look at a hypothesis, over the neighbours of its points: (how many were asked, found, passed over).
+
+    Leaves ``used`` and ``used_target`` as they were.
+    """
+    left, right = frame[2], frame[3]
+    c = point.shape[1]
+    sequence = np.empty(c * near.shape[1], np.int64)
+    length = 0
+    for v in range(c):
+        p = point[h, v]
+        stamp[p] = h
+        used_target[target[h, v]] = True
+        if left[p] >= 0:
+            used[0][left[p]] = True
+        if right[p] >= 0:
+            used[1][right[p]] = True
+    for j in range(near.shape[1]):
+        for v in range(c):
+            p = near[point[h, v], j]
+            if p >= 0 and stamp[p] != h:
+                stamp[p] = h
+                sequence[length] = p
+                length += 1
+    Rh, th, Ph = R[h].copy(), t[h].copy(), P[h].copy()
+    log_ratio[:] = 0.0
+    asked = min(length, _FIRST_ASKED)
+    found = grow(Rh, th, Ph, sequence[:asked], frame, used, scene, used_target, grid, gate, matched, log_ratio)
+    if found > 0 and asked < length:
+        rest = sequence[asked:length]
+        found += grow(Rh, th, Ph, rest, frame, used, scene, used_target, grid, gate, matched, log_ratio)
+        asked = length
+    passed = 0
+    for j in range(asked):
+        p = sequence[j]
+        if matched[p] < 0:
+            passed += matched[p] == -2
+            continue
+        used_target[matched[p]] = False
+        if left[p] >= 0:
+            used[0][left[p]] = False
+        if right[p] >= 0:
+            used[1][right[p]] = False
+    for v in range(c):
+        p = point[h, v]
+        used_target[target[h, v]] = False
+        if left[p] >= 0:
+            used[0][left[p]] = False
+        if right[p] >= 0:
+            used[1][right[p]] = False
+    return asked, found, passed
+
+
+@njit(cache=True, nogil=True)
+def solve(
     R,
     t,
     P,
-    ok,
-    points,
-    targets,
-    neighbours,
-    xyz,
-    cov,
-    left,
-    right,
-    target_xyz,
-    target_cov,
-    target_view,
-    target_spread,
-    start,
-    item,
-    cell_mm,
+    is_valid,
+    own,
+    point,
+    target,
+    near,
+    frame,
+    dots,
+    cams,
+    alive,
+    scene,
+    grid,
+    windows,
+    prior,
     gate,
+    limits,
+    known,
 ):
-    """A first look at each of h hypotheses: the log ratio over the ``neighbours`` of its three points.
+    """The different solutions that h hypotheses lead to, in the order in which they were worked out.
 
-    Returns the mean over the clutter shares (h); -inf where the hypothesis is impossible.
+    A hypothesis names c pairs (``point``, ``target``: (h, c)), or none: then it is the pose itself that is supposed,
+    with its covariance; ``own`` is the log ratio of what it names already. Each gets a first look over the ``near``
+    points of its own; promising ones are worked out over all points, until one has a log ratio of ``enough``; else the
+    best looking ones are. Dots that no point has claimed are asked where the points alone are not enough. ``limits`` is
+    (``enough``, points that a solution must be able to explain, solutions to work out at most); ``known`` (k, n) holds
+    matches of solutions whose hypotheses are skipped.
+
+    Returns (number of solutions s, R, t, covariance, target of each point, squared Mahalanobis distance of each pair,
+    its residual in mm, target of each dot, residual of each dot in slopes, spacing of the targets around each, log
+    ratio, log likelihood, hypotheses looked at).
     """
-    h = len(points)
+    xyz, cov, left, right = frame
+    enough, needed, most = limits
+    cell_mm = grid[3]
+    h, c = point.shape
+    n, d, k = len(xyz), len(dots[0]), len(scene[0])
+    most_dots = 1
+    for p in range(n):
+        most_dots = max(most_dots, left[p] + 1, right[p] + 1)
+    for p in range(d):
+        most_dots = max(most_dots, dots[1][p] + 1)
+    used = (np.zeros(most_dots, np.bool_), np.zeros(most_dots, np.bool_))
+    used_target, is_marked = np.zeros(k, np.bool_), np.zeros(k, np.bool_)
+    stamp = np.full(n, -1, np.int64)
+    look = np.empty(n, np.int64)
+    shares = len(CLUTTER_SHARES)
+    log_ratio = np.zeros(shares)
+    s = 0
+    out_R, out_t, out_P = np.empty((most, 3, 3)), np.empty((most, 3)), np.empty((most, 6, 6))
+    out_matched, out_d2 = np.full((most, n), -1, np.int64), np.full((most, n), np.nan)
+    out_mm, out_spacing = np.full((most, n), np.nan), np.full((most, n), np.nan)
+    out_dot, out_slope = np.full((most, d), -2, np.int64), np.full((most, d), np.nan)
+    out_ratio, out_likelihood = np.empty(most), np.empty(most)
+    no_dots = (dots[0][:0], dots[1][:0], dots[2][:0], dots[3][:0])
     score = np.full(h, -np.inf)
-    matched = np.empty(len(xyz), np.int64)
-    used_left = np.zeros(max(left.max() if len(left) else 0, 0) + 1, np.bool_)
-    used_right = np.zeros(max(right.max() if len(right) else 0, 0) + 1, np.bool_)
-    used_target = np.zeros(len(target_xyz), np.bool_)
-    sequence = np.empty(3 * neighbours.shape[1], np.int64)
-    stamp = np.full(len(xyz), -1, np.int64)
-    Ri = np.empty((3, 3))
-    ti = np.empty(3)
-    Pi = np.empty((6, 6))
-    log_ratio = np.zeros(len(CLUTTER_SHARES))
-    for i in range(h):
-        if not ok[i]:
+    order = np.empty(h, np.int64)
+    waiting = 0
+    looked = 0
+    B, D = np.empty((3, 3)), np.empty((3, 3))
+    PJ = np.empty((6, 3))
+    for i in range(2 * h):  # first all of them as they come, then those that wait, best first
+        if i < h:
+            a = i
+            if not is_valid[a]:
+                continue
+            is_behind = is_known = False
+            for v in range(c):
+                y, w = scene[0][target[a, v]], scene[2][target[a, v]]
+                is_behind |= w[0] * (t[a, 0] - y[0]) + w[1] * (t[a, 1] - y[1]) + w[2] * (t[a, 2] - y[2]) < 0
+            if is_behind:
+                continue
+            for j in range(len(known)):
+                is_same = c > 0
+                for v in range(c):
+                    is_same &= known[j, point[a, v]] == target[a, v]
+                is_known |= is_same
+            if is_known:
+                continue
+            if c:
+                looked += 1
+                asked, found, passed = _look(
+                    a, R, t, P, point, target, near, frame, used, scene, used_target, grid, gate, look, stamp, log_ratio
+                )
+                if c + found + passed + (n - c - asked) < needed:
+                    continue
+                score[a] = log_mean(log_ratio) + own[a]
+                if not score[a] >= 0.5 * enough:
+                    order[waiting] = a
+                    waiting += 1
+                    continue
+        else:
+            if i - h >= waiting:
+                break
+            if i == h:
+                order[:waiting] = order[:waiting][np.argsort(-score[order[:waiting]], kind="mergesort")]
+            a = order[i - h]
+        is_part = False
+        for j in range(s):
+            is_same = True
+            for v in range(c):
+                is_same &= out_matched[j, point[a, v]] == target[a, v]
+            is_part |= is_same
+        if is_part:
             continue
-        behind = False
-        for v in range(3):
-            q = targets[i, v]
-            s = 0.0
-            for c in range(3):
-                s += target_view[q, c] * (t[i, c] - target_xyz[q, c])
-            behind |= s < 0
-        if behind:
-            continue
-        for v in range(3):
-            p = points[i, v]
-            stamp[p] = i
-            used_target[targets[i, v]] = True
-            if left[p] >= 0:
-                used_left[left[p]] = True
-            if right[p] >= 0:
-                used_right[right[p]] = True
-        length = 0
-        for j in range(neighbours.shape[1]):
-            for v in range(3):
-                p = neighbours[points[i, v], j]
-                if p >= 0 and stamp[p] != i:
-                    stamp[p] = i
-                    sequence[length] = p
-                    length += 1
-        Ri[:] = R[i]
-        ti[:] = t[i]
-        Pi[:] = P[i]
+        if s == most:
+            break
+
+        # all points, those nearest to the hypothesis first
+        Rs, ts, Ps = R[a].copy(), t[a].copy(), P[a].copy()
+        matched, dot_target = out_matched[s], out_dot[s]
+        matched[:] = -1
+        dot_target[:] = -2
+        used[0][:] = False
+        used[1][:] = False
+        used_target[:] = False
         log_ratio[:] = 0.0
-        grow(
-            Ri,
-            ti,
-            Pi,
-            sequence[:length],
-            xyz,
-            cov,
-            left,
-            right,
-            used_left,
-            used_right,
-            target_xyz,
-            target_cov,
-            target_view,
-            target_spread,
-            used_target,
-            start,
-            item,
-            cell_mm,
-            gate,
-            matched,
-            log_ratio,
-        )
-        score[i] = log_mean(log_ratio)
-        for v in range(3):
-            p = points[i, v]
-            used_target[targets[i, v]] = False
+        distance = np.empty(n)
+        centre = np.zeros(3)
+        for v in range(c):
+            p = point[a, v]
+            centre += xyz[p] / c
+            matched[p] = target[a, v]
+            used_target[target[a, v]] = True
             if left[p] >= 0:
-                used_left[left[p]] = False
+                used[0][left[p]] = True
             if right[p] >= 0:
-                used_right[right[p]] = False
-        for j in range(length):
-            p = sequence[j]
+                used[1][right[p]] = True
+        for p in range(n):
+            if c:
+                distance[p] = ((xyz[p] - centre) ** 2).sum()
+            else:  # the surest first
+                _lever(Ps, xyz[p], PJ)
+                _predicted_covariance(PJ, xyz[p], cov[p], B)
+                distance[p] = B[0, 0] + B[1, 1] + B[2, 2]
+        by_distance = np.argsort(distance, kind="mergesort")
+        sequence = np.empty(n, np.int64)
+        length = 0
+        for p in by_distance:
+            if matched[p] < 0:
+                sequence[length] = p
+                length += 1
+        for _ in range(2 if c else 3):  # again, those that were too vague or had two counterparts
+            grow(Rs, ts, Ps, sequence[:length], frame, used, scene, used_target, grid, gate, matched, log_ratio)
+            kept = 0
+            for j in range(length):
+                if matched[sequence[j]] == -2:
+                    sequence[kept] = sequence[j]
+                    kept += 1
+            length = kept
+        asks_dots = d > 0 and log_mean(log_ratio) + own[a] < enough
+        if asks_dots:
+            grow_by_dots(Rs, ts, Ps, dots, used, cams, scene, used_target, alive, cell_mm, gate, dot_target, log_ratio)
+        pairs = 0
+        for p in range(n):
+            pairs += matched[p] >= 0
+        if pairs < needed or (pairs < 3 and c):
+            continue
+        asked_dots = dots if asks_dots else no_dots
+        info = prior[2] if pairs < 3 else np.zeros((6, 6))
+        if not _refine(
+            Rs,
+            ts,
+            Ps,
+            frame,
+            scene,
+            matched,
+            asked_dots,
+            cams,
+            dot_target,
+            (prior[0], prior[1], info),
+            gate,
+            out_d2[s],
+            out_mm[s],
+            out_slope[s],
+        ):
+            continue
+        pairs = 0
+        for p in range(n):
+            pairs += matched[p] >= 0
+        if (pairs < 3 and c) or pairs < needed:
+            continue
+        asked_targets = dot_target if asks_dots else dot_target[:0]
+        missed = _log_missed(Rs, ts, frame, scene, matched, asked_targets, windows, 0.25 * cell_mm, is_marked)
+        out_ratio[s] = log_mean(log_ratio) + missed + own[a]
+        _likelihood(Rs, frame, scene, matched, out_d2[s], cell_mm, log_ratio)
+        out_likelihood[s] = log_mean(log_ratio) + missed
+        for p in range(n):
             if matched[p] >= 0:
-                used_target[matched[p]] = False
-                if left[p] >= 0:
-                    used_left[left[p]] = False
-                if right[p] >= 0:
-                    used_right[right[p]] = False
-    return score
+                out_spacing[s, p] = _surroundings(matched[p], scene[0], scene[6], cell_mm, D)[1]
+        out_R[s], out_t[s], out_P[s] = Rs, ts, Ps
+        s += 1
+        if out_ratio[s - 1] >= enough and needed == 0:
+            break
+    return (
+        s,
+        out_R[:s],
+        out_t[:s],
+        out_P[:s],
+        out_matched[:s],
+        out_d2[:s],
+        out_mm[:s],
+        out_dot[:s],
+        out_slope[:s],
+        out_spacing[:s],
+        out_ratio[:s],
+        out_likelihood[:s],
+        looked,
+    )
 
 
 @njit(cache=True, nogil=True)
@@ -636,6 +1156,52 @@ def log_mean(log_values):
     for v in log_values:
         s += np.exp(v - top)
     return top + np.log(s / len(log_values))
+
+
+@njit(cache=True, nogil=True)
+def covering_triples(xyz, needed):
+    """Triples of points of which every set of ``needed`` points contains one.
+
+    The points are parted into g = (needed − 1) // 2 groups of near ones: of 2 g + 1 points, three fall into one group,
+    and every three of a group are a triple.
+    """
+    n = len(xyz)
+    groups = max(1, (needed - 1) // 2)
+    size = (n + groups - 1) // groups
+    group = np.full(n, -1, np.int64)
+    centre = np.zeros(3)
+    for p in range(n):
+        centre += xyz[p] / n
+    out = np.empty((groups * size * (size - 1) * (size - 2) // 6 + 1, 3), np.int64)
+    members = np.empty(size, np.int64)
+    count = 0
+    free = n
+    for g in range(groups):
+        if free == 0:
+            break
+        first, farthest = -1, -1.0
+        for p in range(n):
+            d = ((xyz[p] - centre) ** 2).sum()
+            if group[p] < 0 and d > farthest:
+                first, farthest = p, d
+        here = (free + groups - g - 1) // (groups - g)
+        group[first] = g
+        members[0] = first
+        for m in range(1, here):
+            best, nearest_d = -1, np.inf
+            for p in range(n):
+                d = ((xyz[p] - xyz[first]) ** 2).sum()
+                if group[p] < 0 and d < nearest_d:
+                    best, nearest_d = p, d
+            group[best] = g
+            members[m] = best
+        free -= here
+        for i in range(here):
+            for j in range(i + 1, here):
+                for k in range(j + 1, here):
+                    out[count, 0], out[count, 1], out[count, 2] = members[i], members[j], members[k]
+                    count += 1
+    return out[:count]
 
 
 @njit(cache=True, nogil=True)
@@ -669,19 +1235,36 @@ def warm_up() -> None:
         [[0.0, 0.0, 400.0], [40.0, 0.0, 410.0], [0.0, 60.0, 420.0], [50.0, 70.0, 400.0], [90.0, 20.0, 430.0]]
     )
     cov = np.tile(np.eye(3) * 0.01, (len(xyz), 1, 1))
-    rows = np.arange(len(xyz))
-    none = np.full(len(xyz), -1)
-    view = np.tile([0.0, 0.0, -1.0], (len(xyz), 1))
-    spread = cov.copy()
     neighbours = nearest(xyz, 4)
     triangles = describe_triangles(xyz, cov, -xyz, local_triangles(neighbours), 0.3)[0]
     oriented = orient_triangles(xyz, cov, triangles, xyz, cov, triangles)
-    grid = build_grid(xyz, rows, 10.0)
-    scene = (xyz, cov, none, none, xyz, cov, view, spread)
-    score_hypotheses(*oriented, triangles, triangles, neighbours, *scene, *grid, 10.0, 4.0)
-    R, t, P, _ = (column[0].copy() for column in oriented)
-    used = np.zeros(len(xyz) + 1, dtype=np.bool_)
-    log_ratio = np.zeros(len(CLUTTER_SHARES))
-    targets_with_free = (xyz, cov, view, spread, used.copy())
-    grow(R, t, P, rows, xyz, cov, none, none, used, used, *targets_with_free, *grid, 10.0, 4.0, none.copy(), log_ratio)
-    log_mean(log_ratio)
+    none = np.full(len(xyz), -1)
+    zero = np.zeros(len(xyz), np.int64)
+    view = np.tile([0.0, 0.0, -1.0], (len(xyz), 1))
+    scene = (xyz, cov, view, zero, zero, zero, np.full((len(xyz), 8), -1, np.int32))
+    grid = (np.array([0], np.int32), np.array([1, 2, 3, 4, -1], np.int32), xyz.astype(np.float32), 100.0, 0.1)
+    dots = (zero[:1], zero[:1], np.zeros((1, 2)), np.eye(2)[None])
+    cams = (np.tile(np.eye(3), (2, 1, 1)), np.zeros((2, 3)))
+    windows = (*cams, np.ones((2, 6)))
+    prior = (np.eye(3), np.zeros(3), np.eye(6))
+    own = np.zeros(len(triangles))
+    solve(
+        *oriented[:4],
+        own,
+        triangles,
+        triangles,
+        neighbours,
+        (xyz, cov, none, none),
+        dots,
+        cams,
+        zero,
+        scene,
+        grid,
+        windows,
+        prior,
+        4.0,
+        (20.0, 0, 2),
+        none[None],
+    )
+    log_mean(np.zeros(len(CLUTTER_SHARES)))
+    covering_triples(xyz, 3)

@@ -7,12 +7,21 @@ import numpy as np
 
 from trifix.geometry.alignment import align_weighted
 from trifix.kernels import positioning as kernels
-from trifix.records import Identification, Orientations, ReferenceMap, SensorPoints
+from trifix.records import Identification, Orientations, Prediction, ReferenceMap, SensorPoints
 
 
-def orient(points: SensorPoints, map: ReferenceMap, identification: Identification) -> Orientations:
-    """``T_world_sensor`` of every hypothesis, with its covariance, from the pairs of that hypothesis alone."""
+def orient(
+    points: SensorPoints, map: ReferenceMap, identification: Identification, prediction: Prediction | None = None
+) -> Orientations:
+    """``T_world_sensor`` of every hypothesis, with its covariance, from the pairs of that hypothesis alone.
+
+    One that names no pairs supposes that the sensor is where its motion leads.
+    """
     h, c = identification.point.shape
+    if c == 0:
+        assert prediction is not None, "only a predicted pose needs no pairs"
+        T = prediction.T_world_sensor
+        return Orientations(T.R[None], T.t_mm[None], prediction.cov[None], np.ones(1, dtype=np.bool_), np.zeros(1))
     if c == 3:
         return Orientations(
             *kernels.orient_triangles(
@@ -31,4 +40,4 @@ def orient(points: SensorPoints, map: ReferenceMap, identification: Identificati
         except np.linalg.LinAlgError:
             continue
         R[row], t[row], is_valid[row] = T.R, T.t_mm, True
-    return Orientations(R, t, cov, is_valid)
+    return Orientations(R, t, cov, is_valid, np.full(h, np.nan))

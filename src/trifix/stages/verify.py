@@ -7,26 +7,33 @@ to be reckoned with, bounds the probability of accepting a wrong one. The three 
 that number alone: a triangle that chance would seldom match needs less confirmation. The last motion is evidence too.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from typing import Literal
 
 import numpy as np
 from jaxtyping import Float, Int
 
 from trifix.errors import ConfigError
-from trifix.geometry.alignment import align_weighted, point_jacobian
+from trifix.geometry.alignment import point_jacobian
+from trifix.geometry.camera import Camera, StereoRig
 from trifix.geometry.pose import Pose
+from trifix.index import ANYWHERE_UP_TO, Candidates, MapIndex, frame_triangles
 from trifix.kernels import positioning as kernels
 from trifix.records import (
     Fix,
     Identification,
     NoFix,
     Orientations,
+    PositionedReason,
     Prediction,
     Reason,
     ReferenceMap,
     Rival,
     SensorPoints,
+    SingleDots,
+    StereoDots,
     StereoMatches,
 )
 
@@ -55,7 +62,9 @@ class VerifyOptions:
     max_sigma_deg: float = 0.17
     """Largest standard deviation of the rotation about any axis (degrees)."""
     max_solutions: int = 12
-    """Different solutions to work out in full, best first."""
+    """Rivals to work out in full at most."""
+    max_rivals: int = 20_000
+    """Places to look for rivals at most."""
 
     def __post_init__(self) -> None:
         if not 0 < self.max_p_chance < 1:
@@ -69,194 +78,409 @@ class VerifyOptions:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class Evidence:
+    """What a frame shows of the map, as it is weighed: its points, and its dots where it has some."""
+
+    points: SensorPoints
+    """The points."""
+    left: Int[np.ndarray, "n"]
+    """Row of the left dot of each point; -1 where points were given."""
+    right: Int[np.ndarray, "n"]
+    """Row of the right dot."""
+    dots: StereoDots | None = None
+    """The dots, of which one camera alone may have seen some."""
+    rig: StereoRig | None = None
+    """The stereo geometry that saw them."""
+    noise_scale: float = 1.0
+    """Factor on the dots' standard deviations."""
+
+    @staticmethod
+    def of(
+        points: SensorPoints,
+        matches: StereoMatches | None = None,
+        dots: StereoDots | None = None,
+        rig: StereoRig | None = None,
+        noise_scale: float = 1.0,
+    ) -> "Evidence":
+        """The evidence of points, and of the pairs of dots that they were triangulated from."""
+        if matches is None:
+            none = np.full(len(points), -1)
+            return Evidence(points, none, none)
+        left, right = matches.left[points.match].astype(np.int64), matches.right[points.match].astype(np.int64)
+        return Evidence(points, left, right, dots, rig, noise_scale)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class Solution:
-    """A hypothesis worked out over all points of the frame."""
+    """A hypothesis worked out over all evidence."""
 
     T_world_sensor: Pose
     """The pose, from all its pairs."""
     cov: Float[np.ndarray, "6 6"]
     """Its covariance, as in ``Fix``."""
+    matched: Int[np.ndarray, "n"]
+    """Row of the target of each point, negative for none."""
+    dot_target: Int[np.ndarray, "d"]
+    """Row of the target of each dot that no point claims, negative for none."""
     point: Int[np.ndarray, "c"]
     """Rows of the points that found a target."""
-    target: Int[np.ndarray, "c"]
-    """Rows of those targets."""
-    log_ratio: float
-    """ln of the likelihood ratio against chance."""
+    residual_mm: Float[np.ndarray, "c"]
+    """Their distances from it (mm)."""
+    spacing_mm: Float[np.ndarray, "c"]
+    """Spacing of the targets around it (mm)."""
+    log_likelihood: float
+    """ln of the likelihood of all evidence at this pose against chance: for comparison among solutions."""
+    p_chance: float
+    """Bound of the probability that the agreement is chance."""
+
+    @property
+    def rms_mm(self) -> float:
+        """Root mean square of the residuals (mm)."""
+        return float(np.sqrt(np.mean(self.residual_mm**2))) if len(self.point) else float("nan")
+
+    def as_rival(self) -> Rival:
+        """What is told of it in an ambiguous frame."""
+        return Rival(self.T_world_sensor, self.log_likelihood, len(self.point))
 
 
 _QUICK_NEIGHBOURS = 12  # of each of the three points, for the first look
 _CARRIED_OFF = 1e-3  # ε: probability that the sensor is not where its motion leads
-_SURROUNDING = 5  # neighbours of a target that tell how targets lie around it
+_WORKED_OUT = 6  # solutions in search of the best one
+_MARGIN_PX = 10.0  # nearer to the image's edge a target may well go unseen
+_WINDOW_POINTS = 4  # of given points, to say what the sensor's field of view is
+_WIDER, _SAMPLE = 6.0, 12  # tolerances so much wider, for so many triangles, tell what chance would bring
+_TRIPLES = 10_000  # of points, to be sought all over the map
+_NO_CHANCE = 0.01  # a rival that explains many points is one only if it is no chance itself
+_NOWHERE = (np.eye(3), np.zeros(3), np.zeros((6, 6)))
+_NO_DOTS = (np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros((0, 2)), np.zeros((0, 2, 2)))
+_NO_CAMERAS = (np.zeros((2, 3, 3)), np.zeros((2, 3)))
+_VALID = np.ones(1, dtype=np.bool_)
+_NO_ROWS = np.zeros(0, np.int64)
 
 
 def verify(
-    points: SensorPoints,
+    evidence: Evidence,
     map: ReferenceMap,
+    index: MapIndex,
     identification: Identification,
     orientations: Orientations,
-    matches: StereoMatches | None = None,
-    tried: float = 0.0,
+    earlier: Sequence[Identification] = (),
     prediction: Prediction | None = None,
+    asks_dots: bool = False,
     options: VerifyOptions = VerifyOptions(),
 ) -> Fix | NoFix:
     """The one pose that the frame proves, or why there is none.
 
-    ``tried`` counts the hypotheses that this frame has cost so far, these included (their number, unless told).
+    ``index`` is that of the map as it is now. ``earlier`` are the hypotheses that this frame has cost before these.
 
-    Every hypothesis gets a first look over the neighbours of its three points; the best are worked out over all points
-    until ``max_solutions`` different ones are known. Of two points that share a dot, one at most is matched.
+    Every hypothesis gets a first look; the best are worked out over all points, until one is proven. Then its rivals
+    are sought: all poses that could explain so many points that the frame would be ambiguous. Of two points that share
+    a dot, one at most is matched. With ``asks_dots``, dots that no point claims are evidence as well.
     """
     if len(identification) == 0:
         return NoFix(Reason.no_candidate)
-    spread, spacing_mm = surroundings(map)
-    solutions = solve(points, map, identification, orientations, matches, spread, options)
-    if prediction is not None:
-        area_mm2 = float((spacing_mm**2).sum())
-        gain = [motion_log_ratio(s.T_world_sensor, prediction, area_mm2) for s in solutions]
-        solutions = [replace(s, log_ratio=s.log_ratio + g) for s, g in zip(solutions, gain, strict=True)]
-        solutions.sort(key=lambda s: -s.log_ratio)
-    if not solutions:
+    enough = np.log(max(sum(len(each) for each in earlier) + len(identification), 1) / options.max_p_chance)
+    weighed = _Weighed(evidence, map, index, prediction, options)
+    if asks_dots:
+        weighed.ask_dots()
+    found = weighed.candidates(identification, orientations, earlier, enough)
+    if not found:
         return NoFix(Reason.no_candidate, "Every hypothesis looks at targets from behind or has its points on a line.")
-    return judge(solutions, points, map, spacing_mm, tried + false_hypotheses(identification, solutions[0]), options)
-
-
-def solve(
-    points: SensorPoints,
-    map: ReferenceMap,
-    identification: Identification,
-    orientations: Orientations,
-    matches: StereoMatches | None,
-    spread: Float[np.ndarray, "k 3 3"],
-    options: VerifyOptions,
-) -> list[Solution]:
-    """The different solutions that the hypotheses lead to, best first."""
-    n = len(points)
-    left, right = _dots_of(points, matches)
-    alive = np.flatnonzero(map.alive)
-    sigma2 = np.trace(points.cov_mm2, axis1=1, axis2=2)
-    target_sigma2 = np.trace(map.cov_mm2[alive], axis1=1, axis2=2)
-    cell_mm = max(2.0 * options.gate_sigmas * float(np.sqrt(np.median(sigma2) + np.median(target_sigma2))), 1e-3)
-    grid = kernels.build_grid(map.xyz_mm, alive, cell_mm)
-    scene = (map.xyz_mm, map.cov_mm2, map.view, spread)
-    neighbours = kernels.nearest(points.xyz_mm, min(_QUICK_NEIGHBOURS, n - 1))
-    score = kernels.score_hypotheses(
-        orientations.R,
-        orientations.t_mm,
-        orientations.cov,
-        orientations.is_valid,
-        identification.point,
-        identification.target,
-        neighbours,
-        points.xyz_mm,
-        points.cov_mm2,
-        left,
-        right,
-        *scene,
-        *grid,
-        cell_mm,
-        options.gate_sigmas,
-    )
-    solutions: list[Solution] = []
-    for h in np.argsort(-score, kind="stable"):
-        if not np.isfinite(score[h]) or len(solutions) == options.max_solutions:
-            break
-        seed_point, seed_target = identification.point[h], identification.target[h]
-        if any(_is_part_of(seed_point, seed_target, s) for s in solutions):
-            continue
-        R, t, P = orientations.R[h].copy(), orientations.t_mm[h].copy(), orientations.cov[h].copy()
-        centre = points.xyz_mm[seed_point].mean(axis=0)
-        sequence = np.argsort(((points.xyz_mm - centre) ** 2).sum(axis=1), kind="stable")
-        sequence = sequence[~np.isin(sequence, seed_point)]
-        matched = np.full(n, -1)
-        matched[seed_point] = seed_target
-        used_left, used_right = _marks(left, left[seed_point]), _marks(right, right[seed_point])
-        used_target = _marks(np.arange(len(map)), seed_target)
-        log_ratio = np.zeros(len(kernels.CLUTTER_SHARES))
-        for _ in range(2):  # the second time, those that were too vague or had two counterparts
-            kernels.grow(
-                R,
-                t,
-                P,
-                sequence,
-                points.xyz_mm,
-                points.cov_mm2,
-                left,
-                right,
-                used_left,
-                used_right,
-                *scene,
-                used_target,
-                *grid,
-                cell_mm,
-                options.gate_sigmas,
-                matched,
-                log_ratio,
-            )
-            sequence = sequence[matched[sequence] == -2]
-        point = np.flatnonzero(matched >= 0)
-        solution = _refined(Pose(R, t), point, matched[point], points, map, kernels.log_mean(log_ratio), options)
-        if solution is not None:
-            solutions.append(solution)
-    return sorted(solutions, key=lambda s: -s.log_ratio)
-
-
-def judge(
-    solutions: list[Solution],
-    points: SensorPoints,
-    map: ReferenceMap,
-    spacing_mm: Float[np.ndarray, "k"],
-    tried: float,
-    options: VerifyOptions,
-) -> Fix | NoFix:
-    """Accepts the best solution if it is proven, without rival and firmly held."""
-    best = solutions[0]
-    p_chance = float(np.clip(np.exp(np.log(max(tried, 1e-300)) - best.log_ratio), 1e-300, 1.0))
-    residual = map.xyz_mm[best.target] - best.T_world_sensor.apply(points.xyz_mm[best.point])
-    residual_mm = np.linalg.norm(residual, axis=1)
-    rms_mm = float(np.sqrt(np.mean(residual_mm**2)))
-
-    def refuse(why: Reason, detail: str, rivals: tuple[Rival, ...] = ()) -> NoFix:
-        return NoFix(why, detail, p_chance, len(best.point), rms_mm, rivals)
-
-    if p_chance > options.max_p_chance:
-        return refuse(
-            Reason.not_proven,
-            f"{len(best.point)} of {len(points)} points agree with the map to {rms_mm:.2f} mm; "
-            f"by chance so in up to {p_chance:.1e} of such frames.",
+    best = min(found, key=lambda each: each.p_chance)
+    if best.p_chance > options.max_p_chance:
+        detail = (
+            f"{len(best.point)} of {len(evidence.points)} points agree with the map to {best.rms_mm:.2f} mm; "
+            f"by chance so in up to {best.p_chance:.1e} of such frames."
         )
-    rivals = [s for s in solutions if s is best or _is_rival(best, s, points, spacing_mm, options)]
-    if len(rivals) > 1:
-        return refuse(
-            Reason.ambiguous,
-            f"{len(rivals)} poses explain {', '.join(str(len(s.point)) for s in rivals[:4])} points.",
-            tuple(Rival(s.T_world_sensor, s.log_ratio, len(s.point)) for s in rivals),
-        )
-    fix = Fix(
-        T_world_sensor=best.T_world_sensor,
-        cov=best.cov,
-        point=best.point,
-        target=best.target,
-        residual_mm=residual_mm,
-        p_chance=p_chance,
-    )
-    sigma_mm, sigma_deg = pose_sigma(best.cov, points.xyz_mm[best.point])
+        return NoFix(Reason.not_proven, detail, best.p_chance, len(best.point), best.rms_mm)
+    found += weighed.rivals(found, best)
+    best = max(found, key=lambda each: each.log_likelihood)
+    rivals = [each for each in found if each is not best and weighed.is_rival(best, each)]
+    if rivals or best.p_chance > options.max_p_chance:
+        rivals = sorted(rivals or found, key=lambda each: -each.log_likelihood)
+        told = tuple(each.as_rival() for each in [best, *(each for each in rivals if each is not best)])
+        explained = ", ".join(str(each.matched) for each in told[:4])
+        detail = f"{len(told)} poses explain {explained} points."
+        return NoFix(Reason.ambiguous, detail, best.p_chance, len(best.point), best.rms_mm, told)
+    if weighed.is_mirror_image(best):
+        detail = f"{len(best.point)} points agree with the map; in a mirror more would."
+        return NoFix(Reason.not_proven, detail, 1.0, len(best.point), best.rms_mm)
+    fix = weighed.fix(best)
+    seen_mm = map.xyz_mm[np.concatenate([fix.target, fix.single.target])]
+    sigma_mm, sigma_deg = pose_sigma(fix.cov, fix.T_world_sensor.inverse().apply(seen_mm))
     if sigma_mm > options.max_sigma_mm or sigma_deg > options.max_sigma_deg:
         detail = f"The pose is known to {sigma_mm:.2f} mm and {sigma_deg:.3f} degrees only."
-        return replace(refuse(Reason.weak_geometry, detail), weak=fix)
+        return NoFix(Reason.weak_geometry, detail, fix.p_chance, len(fix.point), best.rms_mm, weak=fix)
     return fix
 
 
-def false_hypotheses(identification: Identification, best: Solution) -> float:
-    """How many false hypotheses must be reckoned with: each is one more chance for chance.
+class _Weighed:
+    """A frame's evidence beside the map, in the form that the compiled loops take."""
 
-    Those that do not belong to the best solution are false if it is right, and tell how many there are if it is wrong.
-    Where they are few, what the technique expects of chance stands in for them, if that is less than all.
+    def __init__(
+        self,
+        evidence: Evidence,
+        map: ReferenceMap,
+        index: MapIndex,
+        prediction: Prediction | None,
+        options: VerifyOptions,
+    ) -> None:
+        self._evidence, self._map, self._index = evidence, map, index
+        self._prediction, self._options = prediction, options
+        points = evidence.points
+        self._frame = (points.xyz_mm, points.cov_mm2, evidence.left, evidence.right)
+        self._scene = (
+            map.xyz_mm,
+            map.cov_mm2,
+            map.view,
+            map.state,
+            map.sightings,
+            map.misses,
+            index.neighbour,
+        )
+        self._near = kernels.nearest(points.xyz_mm, max(min(_QUICK_NEIGHBOURS, len(points) - 1), 0))
+        self._windows = _windows(evidence)
+        self._dots: tuple[np.ndarray, ...] = _NO_DOTS
+        self._cameras, self._alive = _NO_CAMERAS, _NO_ROWS
+        self._prior = _NOWHERE
+        if prediction is not None:
+            T = prediction.T_world_sensor
+            self._prior = (T.R, T.t_mm, np.linalg.inv(prediction.cov))
+
+    def ask_dots(self) -> None:
+        """From now on, dots that no point claims count as well."""
+        self._dots, self._cameras = _all_dots(self._evidence)
+        self._alive = np.flatnonzero(self._map.alive)
+
+    def candidates(
+        self,
+        identification: Identification,
+        orientations: Orientations,
+        earlier: Sequence[Identification],
+        enough: float,
+        needed: int = 0,
+        known: Sequence[Solution] = (),
+    ) -> list[Solution]:
+        """The different solutions of some hypotheses; those beside the ``known`` ones that explain enough points."""
+        n = len(self._evidence.points)
+        most = self._options.max_solutions if needed else _WORKED_OUT
+        s, R, t, cov, matched, _, mm, dot_target, _, spacing, log_ratio, log_likelihood, _ = kernels.solve(
+            orientations.R,
+            orientations.t_mm,
+            orientations.cov,
+            orientations.is_valid,
+            _side_evidence(identification, orientations),
+            identification.point,
+            identification.target,
+            self._near,
+            self._frame,
+            self._dots,
+            self._cameras,
+            self._alive,
+            self._scene,
+            self._index.grid,
+            self._windows,
+            self._prior,
+            self._options.gate_sigmas,
+            (float(enough), needed, most),
+            np.stack([each.matched for each in known]) if known else np.zeros((0, n), np.int64),
+        )
+        solutions = []
+        for k in range(s):
+            T, point = Pose(R[k], t[k]), np.flatnonzero(matched[k] >= 0)
+            gain = self._motion_gain(T, spacing[k, point])
+            # a hypothesis that names no pairs is the motion itself: it has been counted
+            evidence = log_ratio[k] + (gain if identification.point.shape[1] else 0.0)
+            p_chance = self._p_chance(evidence, matched[k], identification, earlier)
+            solutions.append(
+                Solution(
+                    T_world_sensor=T,
+                    cov=cov[k],
+                    matched=matched[k],
+                    dot_target=dot_target[k],
+                    point=point,
+                    residual_mm=mm[k, point],
+                    spacing_mm=spacing[k, point],
+                    log_likelihood=float(log_likelihood[k] + gain),
+                    p_chance=p_chance,
+                )
+            )
+        return solutions
+
+    def _p_chance(
+        self,
+        evidence: float,
+        matched: Int[np.ndarray, "n"],
+        identification: Identification,
+        earlier: Sequence[Identification],
+    ) -> float:
+        """Bound of the probability that chance brought so much evidence, with all hypotheses of the frame paid for.
+
+        There are two ways to a hypothesis where a motion is known, and either may err.
+        """
+        ways = 1.0 if self._prediction is None else 2.0
+        if identification.point.shape[1] == 0:
+            return float(np.clip(ways * np.exp(-max(evidence, 0.0)), 1e-300, 1.0))
+        every = [each for each in (*earlier, identification) if each.point.shape[1]]
+        others = sum(false_hypotheses(each, matched) for each in every)
+        expected = sum(each.expected_by_chance for each in every)
+        number = sum(len(each) for each in every)
+
+        def bound(expected: float) -> float:
+            false = min(max(others, expected), number)
+            return float(np.clip(ways * np.exp(min(np.log(max(false, 1e-300)) - evidence, 0.0)), 1e-300, 1.0))
+
+        p_chance = bound(expected)
+        limit = self._options.max_p_chance
+        if others < expected and p_chance > limit and bound(others) <= limit:
+            p_chance = min(p_chance, bound(self._expected_by_chance(every)))
+        return p_chance
+
+    def _expected_by_chance(self, every: Sequence[Identification]) -> float:
+        """Hypotheses that chance would bring, from how many there would be if lengths agreed far more often.
+
+        If tolerances were k times as wide, chance would bring k³ times as many, and the true ones would hardly count.
+        """
+        points = self._evidence.points
+        triangles = np.unique(np.sort(np.concatenate([each.point for each in every]), axis=1), axis=0)[:_SAMPLE]
+        looked_up = sum(max(each.comparisons, len(each)) for each in every)
+        search = self._index.any if self._index.targets <= ANYWHERE_UP_TO else self._index.local
+        wide = search(points, self._map, triangles, _WIDER * self._options.gate_sigmas, 0.0, self._options.max_rivals)
+        return looked_up * (len(wide) + 1) / (len(triangles) * _WIDER**3)
+
+    def _motion_gain(self, T_world_sensor: Pose, spacing_mm: Float[np.ndarray, "c"]) -> float:
+        """What the last motion adds to the log ratio of a pose."""
+        if self._prediction is None or len(spacing_mm) == 0:
+            return 0.0
+        area_mm2 = self._index.targets * float(np.mean(spacing_mm**2))
+        return motion_log_ratio(T_world_sensor, self._prediction, area_mm2)
+
+    def rivals(self, found: list[Solution], best: Solution) -> list[Solution]:
+        """Solutions that could come too near the best one, beside those that have been found.
+
+        Whatever pose explains m points of the frame explains three of one group, if the points are parted into groups
+        of which there are fewer than m / 2: so a few triples find every pose that can come near enough.
+        """
+        points, options = self._evidence.points, self._options
+        least = best.log_likelihood - np.log(options.min_rival_odds)
+        by_odds = int(np.ceil(least / self._index.largest_evidence(points, self._map)))
+        needed = max(3, min(int(np.ceil(options.max_rival_share * len(best.point))), by_odds))
+        if len(points) < needed:
+            return []
+        candidates = self._congruent(needed)
+        if len(candidates) == 0:
+            return []
+        hypotheses = Identification(
+            candidates.point, candidates.target, candidates.tried, candidates.expected_by_chance
+        )
+        orientations = Orientations(
+            *kernels.orient_triangles(
+                points.xyz_mm,
+                points.cov_mm2,
+                candidates.point,
+                self._map.xyz_mm,
+                self._map.cov_mm2,
+                candidates.target,
+            )
+        )
+        return self.candidates(hypotheses, orientations, (), np.inf, needed, found)
+
+    def _congruent(self, needed: int) -> Candidates:
+        """Where in the map a pose that explains so many points can lie; of what is large, among near targets only."""
+        points, limits = self._evidence.points, (self._options.gate_sigmas, 0.0, self._options.max_rivals)
+        groups = max(1, (needed - 1) // 2)
+        size = len(points) / groups
+        is_small = groups * size**3 / 6 <= _TRIPLES and self._index.targets <= ANYWHERE_UP_TO
+        if is_small:
+            return self._index.any(points, self._map, kernels.covering_triples(points.xyz_mm, needed), *limits)
+        return self._index.local(points, self._map, frame_triangles(points.xyz_mm, points.cov_mm2, 6), *limits)
+
+    def is_rival(self, best: Solution, other: Solution) -> bool:
+        """Whether another solution puts the points elsewhere and yet comes too near the best in explaining them.
+
+        Elsewhere is beyond the noise for one that is nearly as likely, and beyond half the way to the next target for
+        one that explains as many points and is no chance itself: such is the mark of a pattern that repeats itself.
+        """
+        points, options = self._evidence.points, self._options
+        p = best.point if len(best.point) else other.point
+        if len(p) == 0:
+            return False
+        apart = (best.T_world_sensor.inverse() @ other.T_world_sensor).apply(points.xyz_mm[p]) - points.xyz_mm[p]
+        d2 = np.einsum("ni,ni->n", apart, np.linalg.solve(points.cov_mm2[p], apart[:, :, None])[:, :, 0])
+        is_elsewhere = np.median(d2) > options.gate_sigmas**2
+        is_near = best.log_likelihood - other.log_likelihood < np.log(options.min_rival_odds)
+        if is_elsewhere and is_near:
+            return True
+        explains_as_many = len(other.point) >= options.max_rival_share * len(best.point)
+        if not explains_as_many or other.p_chance > _NO_CHANCE or len(best.point) == 0:
+            return False
+        return bool(np.median(np.linalg.norm(apart, axis=1) / best.spacing_mm) > 0.5)
+
+    def is_mirror_image(self, best: Solution) -> bool:
+        """Whether the frame is better explained as the mirror image of what the pose shows.
+
+        Every triangle is its own mirror image in its plane, and so is all that lies in that plane: what else agrees
+        with the mirrored map agrees by no chance, and yet proves nothing.
+        """
+        points, c = self._evidence.points, len(best.point)
+        if c < 3 or 2 * c > len(points) + 3:  # the mirror image would have to explain as many points again
+            return False
+        centre = points.xyz_mm[best.point].mean(axis=0)
+        normal = np.linalg.svd(points.xyz_mm[best.point] - centre)[2][2]
+        H = np.eye(3) - 2 * np.outer(normal, normal)
+        xyz_mm = np.ascontiguousarray((points.xyz_mm - centre) @ H + centre)
+        none = np.zeros((1, 0), dtype=np.int64)
+        T = best.T_world_sensor
+        as_it_is = Orientations(T.R[None], T.t_mm[None], best.cov[None], _VALID, np.zeros(1))
+        mirrored = replace(self._evidence, points=replace(points, xyz_mm=xyz_mm, cov_mm2=H @ points.cov_mm2 @ H))
+        weighed = _Weighed(mirrored, self._map, self._index, None, self._options)
+        found = weighed.candidates(Identification(none, none), as_it_is, (), 0.0)
+        return any(len(each.point) > c and each.log_likelihood > best.log_likelihood for each in found)
+
+    def fix(self, best: Solution) -> Fix:
+        """A solution as the answer."""
+        fix = Fix(
+            T_world_sensor=best.T_world_sensor,
+            cov=best.cov,
+            point=best.point,
+            target=best.matched[best.point],
+            residual_mm=best.residual_mm,
+            p_chance=best.p_chance,
+        )
+        seen = np.flatnonzero(best.dot_target >= 0)
+        evidence = self._evidence
+        if len(seen) and evidence.dots is not None and evidence.rig is not None:
+            camera, dot = self._dots[0][seen], self._dots[1][seen]
+            target, T = best.dot_target[seen], best.T_world_sensor
+            fix = replace(fix, single=SingleDots.of(camera, dot, target, evidence.dots, evidence.rig, T, self._map))
+        if len(best.point) < 3:
+            detail = f"{len(best.point)} points and {len(seen)} dots of a single camera, near where the motion leads."
+            fix = replace(fix, reason=PositionedReason.few_points, detail=detail)
+        return fix
+
+
+def fewest_points(index: MapIndex, points: SensorPoints, map: ReferenceMap, options: VerifyOptions) -> int:
+    """Points that a pose must explain to be proven without any motion: three, and the evidence of the others."""
+    return 3 + max(1, int(np.ceil(-np.log(options.max_p_chance) / index.largest_evidence(points, map))))
+
+
+def _side_evidence(identification: Identification, orientations: Orientations) -> Float[np.ndarray, "h"]:
+    """How well the sides of each hypothesis' triangle agree, against anyhow within the tolerance: ln of N(Δ) · volume.
+
+    False ones fill the box of ± k standard deviations evenly, true ones lie about its middle.
     """
-    target_of = np.full(int(identification.point.max()) + 1, -1)
-    known = best.point[best.point < len(target_of)]
-    target_of[known] = best.target[: len(known)]
-    others = int((target_of[identification.point] != identification.target).any(axis=1).sum())
-    return min(max(others, identification.expected_by_chance), len(identification))
+    if identification.max_sigmas == 0 or identification.point.shape[1] != 3:
+        return np.zeros(len(identification))
+    volume = 3 * np.log(2 * identification.max_sigmas) - 1.5 * np.log(2 * np.pi)
+    return np.asarray(volume - 0.5 * np.nan_to_num(orientations.d2))
+
+
+def false_hypotheses(identification: Identification, matched: Int[np.ndarray, "n"]) -> int:
+    """Hypotheses that do not belong to a solution: each was one more chance for chance.
+
+    If the solution is right, they are the false ones; if it is wrong, they tell how many false ones there are.
+    """
+    return int((matched[identification.point] != identification.target).any(axis=1).sum())
 
 
 def motion_log_ratio(T_world_sensor: Pose, prediction: Prediction, area_mm2: float) -> float:
@@ -282,92 +506,57 @@ def pose_sigma(cov: Float[np.ndarray, "6 6"], xyz_mm: Float[np.ndarray, "c 3"]) 
     return float(np.sqrt(variance.mean())), float(np.degrees(np.sqrt(np.linalg.eigvalsh(cov[3:, 3:])[-1])))
 
 
-def surroundings(
-    map: ReferenceMap,
-) -> tuple[Float[np.ndarray, "k 3 3"], Float[np.ndarray, "k"]]:
-    """Around each living target: the mean square offsets of its five nearest (mm²), and the spacing (mm)."""
-    from scipy.spatial import cKDTree
+def _windows(evidence: Evidence) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Where a target must be to be seen: for each camera its rotation, its translation, limits of slopes and depth.
 
-    alive = np.flatnonzero(map.alive)
-    spread, spacing_mm = np.zeros((len(map), 3, 3)), np.zeros(len(map))
-    k = min(_SURROUNDING, len(alive) - 1)
-    if k >= 1:
-        xyz = map.xyz_mm[alive]
-        distance, nearest = cKDTree(xyz).query(xyz, k=k + 1)
-        offset = xyz[nearest[:, 1:]] - xyz[:, None]
-        spread[alive] = np.einsum("nki,nkj->nij", offset, offset) / k
-        spacing_mm[alive] = distance[:, -1] * np.sqrt(np.pi / k)
-    return spread, spacing_mm
-
-
-def _refined(
-    T: Pose,
-    point: Int[np.ndarray, "c"],
-    target: Int[np.ndarray, "c"],
-    points: SensorPoints,
-    map: ReferenceMap,
-    log_ratio: float,
-    options: VerifyOptions,
-) -> Solution | None:
-    """The solution with its pose from all pairs that stay within the gate; None if too few do."""
-    cov = np.zeros((6, 6))
-    for _ in range(2):
-        if len(point) < 3:
-            return None
-        C_point, C_target = points.cov_mm2[point], map.cov_mm2[target]
-        try:
-            T, cov = align_weighted(points.xyz_mm[point], map.xyz_mm[target], C_point, C_target, initial=T)
-        except np.linalg.LinAlgError:
-            return None
-        r = map.xyz_mm[target] - T.apply(points.xyz_mm[point])
-        S = T.R @ C_point @ T.R.T + C_target
-        d2 = np.einsum("ni,ni->n", r, np.linalg.solve(S, r[:, :, None])[:, :, 0])
-        keep = d2 <= options.gate_sigmas**2
-        if keep.all():
-            break
-        point, target = point[keep], target[keep]
-    if len(point) < 3:
-        return None
-    return Solution(T, cov, point, target, log_ratio)
-
-
-def _is_rival(
-    best: Solution,
-    other: Solution,
-    points: SensorPoints,
-    spacing_mm: Float[np.ndarray, "k"],
-    options: VerifyOptions,
-) -> bool:
-    """Whether another solution puts the points elsewhere and yet comes too near the best in explaining them.
-
-    Elsewhere is beyond the noise for one that is nearly as likely, and beyond half the way to the next target for one
-    that explains as many points: such is the mark of a pattern that repeats itself.
+    Without a rig the slopes and depths that the frame's points fill stand for the field of view.
     """
-    p = best.point
-    apart = (best.T_world_sensor.inverse() @ other.T_world_sensor).apply(points.xyz_mm[p]) - points.xyz_mm[p]
-    d2 = np.einsum("ni,ni->n", apart, np.linalg.solve(points.cov_mm2[p], apart[:, :, None])[:, :, 0])
-    is_elsewhere = np.median(d2) > options.gate_sigmas**2
-    is_on_others = np.median(np.linalg.norm(apart, axis=1) / spacing_mm[best.target]) > 0.5
-    is_near = other.log_ratio > best.log_ratio - np.log(options.min_rival_odds)
-    explains_as_many = len(other.point) >= options.max_rival_share * len(best.point)
-    return bool((is_elsewhere and is_near) or (is_on_others and explains_as_many))
+    xyz = evidence.points.xyz_mm
+    if len(xyz) < _WINDOW_POINTS:
+        return np.zeros((0, 3, 3)), np.zeros((0, 3)), np.zeros((0, 6))
+    near_mm, far_mm = xyz[:, 2].min(), xyz[:, 2].max()
+    if evidence.rig is None:
+        slope = xyz[:, :2] / xyz[:, 2:]
+        low, high = slope.min(axis=0), slope.max(axis=0)
+        limits = np.array([[low[0], high[0], low[1], high[1], near_mm, far_mm]])
+        return np.eye(3)[None], np.zeros((1, 3)), limits
+    rig = evidence.rig
+    R, t = np.stack([np.eye(3), rig.T_right_left.R]), np.stack([np.zeros(3), rig.T_right_left.t_mm])
+    limits = np.array([[*_inner_slopes(rig.left), near_mm, far_mm], [*_inner_slopes(rig.right), 0.0, np.inf]])
+    return R, t, limits
 
 
-def _is_part_of(point: Int[np.ndarray, "3"], target: Int[np.ndarray, "3"], solution: Solution) -> bool:
-    where = np.searchsorted(solution.point, point)
-    where = np.minimum(where, len(solution.point) - 1)
-    return bool(np.all((solution.point[where] == point) & (solution.target[where] == target)))
+@lru_cache(maxsize=64)
+def _inner_slopes(camera: Camera) -> tuple[float, float, float, float]:
+    """Limits of the slopes (x low, x high, y low, y high) that are well inside the image whatever the other slope."""
+    u = np.linspace(_MARGIN_PX, camera.width_px - 1 - _MARGIN_PX, 9)
+    v = np.linspace(_MARGIN_PX, camera.height_px - 1 - _MARGIN_PX, 9)
+
+    def slopes(u: np.ndarray, v: np.ndarray) -> np.ndarray:
+        return camera.unproject(np.stack(np.broadcast_arrays(u, v), axis=1).astype(float))
+
+    return (
+        float(np.nanmax(slopes(u[:1], v)[:, 0])),
+        float(np.nanmin(slopes(u[-1:], v)[:, 0])),
+        float(np.nanmax(slopes(u, v[:1])[:, 1])),
+        float(np.nanmin(slopes(u, v[-1:])[:, 1])),
+    )
 
 
-def _dots_of(points: SensorPoints, matches: StereoMatches | None) -> tuple[Int[np.ndarray, "n"], Int[np.ndarray, "n"]]:
-    """The two dots of each point; -1 where the points were given."""
-    if matches is None:
-        none = np.full(len(points), -1)
-        return none, none.copy()
-    return matches.left[points.match].astype(np.int64), matches.right[points.match].astype(np.int64)
-
-
-def _marks(values: Int[np.ndarray, "n"], marked: Int[np.ndarray, "m"]) -> np.ndarray:
-    out = np.zeros(int(values.max(initial=-1)) + 2, dtype=np.bool_)
-    out[marked[marked >= 0]] = True
-    return out
+def _all_dots(evidence: Evidence) -> tuple[tuple[np.ndarray, ...], tuple[np.ndarray, np.ndarray]]:
+    """All dots as (camera, row, slopes, covariance of the slopes), and the cameras' rotations and translations."""
+    rig, dots = evidence.rig, evidence.dots
+    assert rig is not None, "dots come with the rig that saw them"
+    assert dots is not None, "asked before"
+    camera, row, xy, cov = [], [], [], []
+    for side, (seen, by) in enumerate(((dots.left, rig.left), (dots.right, rig.right))):
+        slopes = by.unproject(seen.uv_px)
+        J = by.unproject_jacobian(slopes)
+        C = evidence.noise_scale**2 * J @ seen.cov_px2 @ J.transpose(0, 2, 1)
+        good = np.flatnonzero(np.isfinite(slopes).all(axis=1) & np.isfinite(C).all(axis=(1, 2)))
+        camera.append(np.full(len(good), side))
+        row.append(good)
+        xy.append(slopes[good])
+        cov.append(C[good])
+    cameras = np.stack([np.eye(3), rig.T_right_left.R]), np.stack([np.zeros(3), rig.T_right_left.t_mm])
+    return tuple(np.concatenate(each) for each in (camera, row, xy, cov)), cameras

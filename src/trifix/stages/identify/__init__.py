@@ -11,6 +11,7 @@ import numpy as np
 from jaxtyping import Int
 
 from trifix.geometry.pose import Pose
+from trifix.index import MapIndex
 from trifix.records import Identification, ReferenceMap, SensorPoints
 from trifix.stages.identify.congruence import IdentifyOptions
 from trifix.stages.identify.delaunay import DelaunayTriangles
@@ -18,10 +19,12 @@ from trifix.stages.identify.distances import Distances
 from trifix.stages.identify.frequency import FrequencyTriangles
 from trifix.stages.identify.hashing import HashedTriangles
 from trifix.stages.identify.icp import ClosestPoints
+from trifix.stages.identify.index import IndexedTriangles, any_triangles
 from trifix.stages.identify.minimal import MinimalTriangles
 from trifix.stages.identify.triangles import AllTriangles
 
 __all__ = [
+    "AS_PREDICTED",
     "AllTriangles",
     "ClosestPoints",
     "DelaunayTriangles",
@@ -30,9 +33,15 @@ __all__ = [
     "HashedTriangles",
     "Identifier",
     "IdentifyOptions",
+    "IndexedTriangles",
     "MinimalTriangles",
+    "any_triangles",
     "identifier",
 ]
+
+
+AS_PREDICTED = Identification(np.zeros((1, 0), dtype=np.int64), np.zeros((1, 0), dtype=np.int64), 0, 1.0)
+"""The hypothesis that names no pair: the sensor is where its motion leads."""
 
 
 @runtime_checkable
@@ -62,9 +71,11 @@ class Identifier(Protocol):
         ...
 
 
-def identifier(options: IdentifyOptions) -> Identifier:
-    """The technique that the options name, with an empty memory."""
+def identifier(options: IdentifyOptions, index: MapIndex | None = None) -> Identifier:
+    """The technique that the options name, with an empty memory; ``index`` is that of the map, if there is one."""
     match options.technique:
+        case "index":
+            return IndexedTriangles(options, index or MapIndex())
         case "icp":
             return ClosestPoints(options)
         case "distances":

@@ -12,17 +12,21 @@ from trifix.errors import ConfigError
 from trifix.kernels import matching, positioning
 from trifix.records import Identification, ReferenceMap, SensorPoints
 
-Technique = Literal["frequency", "minimal", "delaunay", "triangles", "hashing", "distances", "icp"]
+Technique = Literal["index", "frequency", "minimal", "delaunay", "triangles", "hashing", "distances", "icp"]
 FrameTriangles = Literal["auto", "all", "local"]
+Start = Literal["auto", "prediction", "nothing"]
 
 
 @dataclass(frozen=True, slots=True)
 class IdentifyOptions:
     """Which technique, and when two triangles are congruent."""
 
-    technique: Technique = "frequency"
-    """Triangles of the map by pairs most often seen together (frequency), by nearest neighbours (minimal), on the
-    convex surface (delaunay) or all (triangles; in a hash table: hashing); distances; closest points (icp)."""
+    technique: Technique = "index"
+    """Local triangles from the map's index (index). Or one of the paper's: triangles of the map by pairs most often
+    seen together (frequency), by nearest neighbours (minimal), on the convex surface (delaunay) or all (triangles; in a
+    hash table: hashing); distances; closest points (icp)."""
+    start: Start = "auto"
+    """Where to look: where the motion leads first and then from nothing (auto), or in one of the two ways alone."""
     frame_triangles: FrameTriangles = "auto"
     """Triangles formed in the frame, unless the technique has its own: all of them, those among near neighbours
     (local), or all up to 40 points (auto)."""
@@ -35,9 +39,11 @@ class IdentifyOptions:
     portion: int = 1000
     """Triangles of the map to compare before what was found is verified, likeliest first."""
     max_hypotheses: int = 10_000
-    """Hypotheses to try at most of each portion, likeliest first."""
+    """Hypotheses to try at most, likeliest first; a frame that needs more is refused."""
     widens: bool = True
-    """What the technique does not find is sought among all triangles, in maps of up to 300 targets."""
+    """What the technique does not find is sought among all triangles, near or wide, in maps of up to 300 targets."""
+    max_comparisons: int = 3_000_000
+    """Pairs of targets to look at most in that wider search."""
     max_points: int = 2000
     """A frame of more points, false pairs among them, is refused: it could not be searched in time."""
     max_step_mm: float = 30.0
