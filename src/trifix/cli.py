@@ -73,7 +73,7 @@ def run(
     paper: bool = False,
     identify: Technique | None = None,
     verify: Literal["probability", "residual"] | None = None,
-    update: Literal["kalman", "mean"] | None = None,
+    update: Literal["joint", "kalman", "mean"] | None = None,
     frame_triangles: Literal["auto", "all", "local"] | None = None,
     sigma_px: float | None = None,
     target_diameter_mm: float | None = None,
@@ -94,7 +94,7 @@ def run(
             instead of a file's.
         identify: Technique by which points are matched to the map.
         verify: Believe a pose that cannot be chance, or whose residuals are small.
-        update: Average a target's sightings by their covariances, or all alike.
+        update: Average the sightings of all targets together, of each by their covariances, or of each all alike.
         frame_triangles: Look at all triangles of a frame, or at those between neighbours.
         sigma_px: Standard deviation of a dot's centre to start from, where the recording states none (px); 0.3 unless
             an option says otherwise.

@@ -11,12 +11,12 @@ from time import perf_counter
 from typing import assert_never
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Int
 
 from trifix.config import Config
-from trifix.geometry.alignment import point_jacobian
 from trifix.geometry.pose import Pose
 from trifix.index import MapIndex
+from trifix.joint import JointMap
 from trifix.records import (
     Event,
     Fix,
@@ -66,7 +66,10 @@ class Island:
         self._care = Care(config.tend)
         move = config.predict
         self._hand = Hand(move.acceleration_mm_s2, move.angular_acceleration_rad_s2, move.max_gap_s)
-        self._gauge = np.zeros((6, 6))
+        self._joint: JointMap | None = None
+        if config.update.method == "joint" and not is_frozen:
+            self._joint = JointMap(config.update.joint_targets)
+            self._joint.adopt(map, np.flatnonzero(map.alive))
         self.motion: Motion | None = None
         self._config = config
         self._is_frozen = is_frozen
@@ -161,12 +164,11 @@ class Island:
             self.identifier.learn(self.map, fix.target)
             return NOTHING
         if fix.reason is PositionedReason.defines_world:
-            self._gauge = _pose_covariance(points.xyz_mm, points.cov_mm2)
-            self.map, added = found_map(points, frame.index, next_id)
+            self.map, added = found_map(points, frame.index, next_id, self._joint)
         else:
             before = self.map
             self.map, added = update(
-                self.map, points, matches, fix, frame.index, frame.rig, next_id, self._config.update
+                self.map, points, matches, fix, frame.index, frame.rig, next_id, self._config.update, self._joint
             )
             gone = np.flatnonzero(before.alive)
             self.removed = before.id[gone[before.id[gone] != np.where(self.map.alive, self.map.id, -1)[gone]]]
@@ -175,23 +177,21 @@ class Island:
         self._follow_map(np.unique(np.concatenate([fix.target, added])))
         return added
 
-    def in_gauge(self, fix: Fix) -> Fix:
-        """The fix with what it owes to the first frame, whose coordinates are this map's, in its covariance.
+    def told(self, points: SensorPoints, fix: Fix) -> Fix:
+        """The fix by all that is known of the map before it learns from it: what the world is told of it.
 
-        Averaging makes the targets' covariances small, as if their common error left with the others. In the first
-        frame's coordinates it stays: they are known as well as that frame's own pose. Of n sightings, 1/n of it is
-        still in the targets' covariances.
+        Verification takes the targets' errors for independent, as those that they have in common are nothing to it.
         """
-        if fix.reason is PositionedReason.defines_world:
+        if self._joint is None or fix.reason is PositionedReason.defines_world:
             return fix
-        seen = self.map.sightings[np.concatenate([fix.target, fix.single.target])]
-        averaged = 1.0 - 1.0 / np.maximum(seen, 1).mean()
-        A = fix.T_world_sensor.inverse().adjoint()
-        return replace(fix, cov=fix.cov + averaged * (A @ self._gauge @ A.T))
+        T, cov = self._joint.settle(self.map, points, fix)
+        residual_mm = np.linalg.norm(self.map.xyz_mm[fix.target] - T.apply(points.xyz_mm[fix.point]), axis=1)
+        return replace(fix, T_world_sensor=T, cov=cov, residual_mm=residual_mm)
 
     def rescale(self, ratio: float) -> None:
         """Follows a change of the noise scale: all covariances are in proportion to its square."""
-        self._gauge = self._gauge * ratio**2
+        if self._joint is not None:
+            self._joint.rescale(ratio)
         self._care.rescale(ratio)
         self.map = replace(self.map, cov_mm2=self.map.cov_mm2 * ratio**2)
 
@@ -222,7 +222,9 @@ class Island:
     def absorb(self, other: "Island", T_other_sensor: Pose, bridge: Fix, frame: Frame, next_id: int) -> int:
         """Takes over the other island's living targets across a bridge; returns how many of them are new here."""
         points = other.seen_from(T_other_sensor, np.flatnonzero(other.map.alive))
-        self.map, added = update(self.map, points, None, bridge, frame.index, None, next_id, self._config.update)
+        self.map, added = update(
+            self.map, points, None, bridge, frame.index, None, next_id, self._config.update, self._joint
+        )
         self.frames += other.frames
         other.is_absorbed = True
         self._follow_map(np.unique(np.concatenate([bridge.target, added])))
@@ -250,12 +252,6 @@ class Island:
             label=np.full(len(rows), -1),
             row=np.arange(len(rows)),
         )
-
-
-def _pose_covariance(xyz_mm: Float[np.ndarray, "n 3"], cov_mm2: Float[np.ndarray, "n 3 3"]) -> np.ndarray:
-    """Covariance of the pose of a sensor that sees n points, were they known exactly: (Σ Jᵀ C⁻¹ J)⁻¹."""
-    J = point_jacobian(xyz_mm)
-    return np.asarray(np.linalg.inv(np.einsum("nij,nik->jk", J, np.linalg.solve(cov_mm2, J))))
 
 
 class Stopwatch:

@@ -119,6 +119,7 @@ class Positioner:
         evidence = None if points is None else Evidence.of(points, matches, dots, frame.rig, self.noise.scale)
         island, identification, fix = self._position(frame, evidence, clock)
         there: Fix | None = fix if isinstance(fix, Fix) else None
+        told = self._told(island, points, there, clock)
         if learns and points is not None and evidence is not None:
             if there is not None and island is not None:
                 added = self._learn(frame, points, matches, island, there, clock)
@@ -126,23 +127,25 @@ class Positioner:
                 events += island.events
             elif self._may_found(points, fix):
                 island, there = self._found_island(frame, points)
+                told = there
                 events.append(Event("island_founded", None, f"island {island.number}, {len(points)} targets"))
             if there is not None and island is not None and (island is not self._world or len(added)):
                 events += self._join_islands(frame, island, there, clock)
                 if island.is_absorbed:  # the island has just become part of the world
                     island = self._world
                     identification, fix = island.position(evidence, island.predicted(frame.timestamp_ns), clock)
+                    told = self._told(island, points, fix if isinstance(fix, Fix) else None, clock)
             if isinstance(fix, NoFix) and fix.weak is not None:
                 self._take_weak(frame, points, matches, fix.weak, clock)
         elif there is not None and island is not None:
             island.follow(frame.timestamp_ns, there)
         elsewhere = None
-        if island is not None and island is not self._world and there is not None:
-            elsewhere, added = Elsewhere(island.number, island.in_gauge(there), island.map), NOTHING
+        if island is not None and island is not self._world and told is not None:
+            elsewhere, added = Elsewhere(island.number, told, island.map), NOTHING
             if isinstance(fix, Fix):
                 fix = NoFix(Reason.other_island, f"It is on island {island.number}, of {len(island.map)} targets.")
-        elif isinstance(fix, Fix):
-            fix = self._world.in_gauge(fix)
+        elif told is not None:
+            fix = told
         return Step(
             frame=frame,
             dots=dots,
@@ -157,6 +160,13 @@ class Positioner:
             timings_ms=clock.ms,
             elsewhere=elsewhere,
         )
+
+    def _told(self, island: Island | None, points: SensorPoints | None, fix: Fix | None, clock: Stopwatch) -> Fix | None:
+        """The fix as it is told, with all that its map owes to its beginning."""
+        if island is None or points is None or fix is None:
+            return None
+        with clock("update"):
+            return island.told(points, fix)
 
     def _sense(
         self, frame: Frame, clock: Stopwatch

@@ -32,21 +32,24 @@ def teach(
     t: Float[np.ndarray, "3"],
     pose_cov: Float[np.ndarray, "6 6"],
     frame_index: int,
+    stays: bool,
     is_mean: bool,
     trusted_after: int,
     max_misses: int,
 ) -> None:
     """Identified targets learn from their sightings; the others, as many as ``is_expected`` has, may have missed one.
 
-    Kalman: K = C (C + C_seen)⁻¹; mean: (n x + x_seen) / (n + 1) with covariance (n² C + C_seen) / (n + 1)².
+    Kalman: K = C (C + C_seen)⁻¹; mean: (n x + x_seen) / (n + 1) with covariance (n² C + C_seen) / (n + 1)². A target
+    that ``stays`` has been moved already: its covariance alone learns.
     """
-    place, C, S, K = np.empty(3), np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3))
+    place, C, S, K, left = np.empty(3), np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3)), np.empty(3)
     is_seen = np.zeros(len(is_expected), np.bool_)
     for i in range(len(point)):
         p, q = point[i], target[i]
         is_seen[q] = True
         _to_world(points[p], points_cov[p], R, t, pose_cov, place, C)
         n = max(sightings[q], 1)  # a position that was given counts as one sighting
+        left[:] = xyz[q]
         if is_mean:
             for r in range(3):
                 xyz[q, r] += (place[r] - xyz[q, r]) / (n + 1.0)
@@ -68,6 +71,8 @@ def teach(
             for r in range(3):
                 for c in range(3):
                     cov[q, r, c] = 0.5 * (C[r, c] + C[c, r])
+        if stays:
+            xyz[q] = left
         _towards(t, xyz[q], place)
         for c in range(3):
             place[c] += view[q, c] * n if np.isfinite(view[q, c]) else 0.0
@@ -310,7 +315,7 @@ def warm_up() -> None:
     numbers = [np.zeros(k, np.int64) for _ in range(4)]
     points, rows, none = np.array([[0.0, 0, 1], [0, 0, 900]]), np.arange(1), np.zeros(0, np.int64)
     seen, pose = (points, cov[:2].copy()), (np.eye(3), np.zeros(3), np.eye(6))
-    teach(xyz, cov, view, *numbers, np.ones(3, np.bool_), *seen, rows, rows, *pose, 0, False, 3, 8)
+    teach(xyz, cov, view, *numbers, np.ones(3, np.bool_), *seen, rows, rows, *pose, 0, False, False, 3, 8)
     new = new_points(xyz, cov, numbers[3], 3, *seen, rows, np.zeros(2, np.int64), none, none, *pose, 6.0)
     enter_points(numbers[0].copy(), xyz, cov, view, *numbers, 3, *seen, new, *pose, 0, 3)
     distinct_points(points, rows)

@@ -1,7 +1,10 @@
 """Reference map x fix -> reference map (the paper's parts P6 and P10).
 
-Known targets are averaged with the new sighting by covariance (a Kalman filter a target), new points enter, and what
-was seen once and never again although it should have been, goes. Knows no image.
+Known targets are averaged with the new sighting by covariance, new points enter, and what was seen once and never again
+although it should have been, goes. Knows no image.
+
+A target's own covariance is what tells it from its neighbours: identification needs no more, as an error that they have
+in common moves the pose alone. What they have in common is known to the joint map, where there is one.
 """
 
 from dataclasses import dataclass
@@ -13,6 +16,7 @@ from jaxtyping import Float, Int
 from trifix.errors import ConfigError
 from trifix.geometry.camera import StereoRig
 from trifix.geometry.pose import Pose
+from trifix.joint import JointMap
 from trifix.kernels import floats, integers
 from trifix.kernels.mapping import distinct_points, enter_points, new_points, teach
 from trifix.kernels.stereo import expected_targets
@@ -25,9 +29,12 @@ _NO_RIG = np.zeros(0)
 class UpdateOptions:
     """How the map grows and what it drops."""
 
-    method: Literal["kalman", "mean"] = "kalman"
-    """A sighting counts by its covariance (Smith, Self and Cheeseman 1990), or as much as every other one; prefer the
-    mean only to see what the covariances are worth."""
+    method: Literal["joint", "kalman", "mean"] = "joint"
+    """All targets at once, with what their errors have in common (Smith, Self and Cheeseman 1990); each for itself, a
+    sighting counting by its covariance, which leaves poses overconfident; or as much as every other one: prefer the
+    mean only to see what covariances are worth."""
+    joint_targets: int = 100
+    """joint: of so many targets, those seen last, all correlations are kept."""
     trusted_after: int = 3
     """Sightings after which a target is trusted."""
     new_target_sigmas: float = 6.0
@@ -38,13 +45,20 @@ class UpdateOptions:
     def __post_init__(self) -> None:
         if self.trusted_after < 1 or self.max_misses < 0 or self.new_target_sigmas < 0:
             raise ConfigError("update.trusted_after must be at least 1, max_misses and new_target_sigmas at least 0.")
+        if self.joint_targets < 10:
+            raise ConfigError(f"update.joint_targets is {self.joint_targets}, expected at least 10.")
 
 
-def found_map(points: SensorPoints, frame_index: int, next_id: int = 0) -> tuple[ReferenceMap, Int[np.ndarray, "a"]]:
+def found_map(
+    points: SensorPoints, frame_index: int, next_id: int = 0, joint: JointMap | None = None
+) -> tuple[ReferenceMap, Int[np.ndarray, "a"]]:
     """The map of the first frame, whose sensor coordinates become the world's, and the rows of its targets."""
     rows = distinct(points, np.arange(len(points)))
     map = stored(ReferenceMap.empty(), len(rows))
-    return _entered(map, 0, points, rows, Pose.identity(), np.zeros((6, 6)), frame_index, next_id)
+    map, added = _entered(map, 0, points, rows, Pose.identity(), np.zeros((6, 6)), frame_index, next_id)
+    if joint is not None:
+        joint.adopt(map, added)
+    return map, added
 
 
 def update(
@@ -56,10 +70,16 @@ def update(
     rig: StereoRig | None,
     next_id: int,
     options: UpdateOptions = UpdateOptions(),
+    joint: JointMap | None = None,
 ) -> tuple[ReferenceMap, Int[np.ndarray, "a"]]:
-    """The map after a fix, and the rows of the targets that entered it; the given map is left as it was."""
-    k, T = len(map), fix.T_world_sensor
+    """The map after a fix, and the rows of the targets that entered it; the given map is left as it was.
+
+    The joint map, where there is one, learns as well, and says where the targets are.
+    """
+    k = len(map)
     map = stored(map, len(points))
+    known = None if joint is None else joint.learn(_first(map, k), points, fix)
+    T = fix.T_world_sensor if known is None else known.T_world_sensor
     xyz, cov = floats(points.xyz_mm), floats(points.cov_mm2)
     pose = floats(T.R), floats(T.t_mm), floats(fix.cov)
     point, target = integers(fix.point), integers(fix.target)
@@ -87,6 +107,7 @@ def update(
         target,
         *pose,
         frame_index,
+        joint is not None,
         options.method == "mean",
         options.trusted_after,
         options.max_misses,
@@ -106,7 +127,10 @@ def update(
         *pose,
         float(options.new_target_sigmas),
     )
-    return _entered(map, k, points, new, T, fix.cov, frame_index, next_id)
+    map, added = _entered(map, k, points, new, T, fix.cov, frame_index, next_id)
+    if joint is not None and known is not None:
+        joint.enter(map, points, new, added, known)
+    return map, added
 
 
 def distinct(points: SensorPoints, rows: Int[np.ndarray, "r"]) -> Int[np.ndarray, "d"]:
@@ -159,4 +183,10 @@ def _entered(
         next_id,
     )
     k = max(k, int(rows.max(initial=-1)) + 1)
-    return ReferenceMap(*(column[:k] for column in columns)), rows
+    return _first(map, k), rows
+
+
+def _first(map: ReferenceMap, k: int) -> ReferenceMap:
+    """The first k rows, in the same storage."""
+    columns = (map.id, map.xyz_mm, map.cov_mm2, map.view, map.sightings, map.last_seen, map.misses, map.state)
+    return ReferenceMap(*(column[:k] for column in columns))
