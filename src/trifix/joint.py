@@ -250,11 +250,10 @@ class JointMap:
             self._block[row] = _NOBODY
             cross[:, 3 * b : 3 * b + 3] = 0.0
         f, g = self._take(_PLACE), self._take(_PLACE)
-        for part, b in ((0, 3 * f), (3, 3 * g)):
-            self._P[b : b + 3, :used] = cross[part : part + 3]
-            self._P[:used, b : b + 3] = cross[part : part + 3].T
-            for other, c in ((0, 3 * f), (3, 3 * g)):
-                self._P[b : b + 3, c : c + 3] = cov[part : part + 3, other : other + 3]
+        place = np.concatenate([np.arange(3 * f, 3 * f + 3), np.arange(3 * g, 3 * g + 3)])
+        self._P[place, :used] = cross
+        self._P[:used, place] = cross.T
+        self._P[np.ix_(place, place)] = cov
         self._own[rows] = 2.0 * own
         self._place[rows] = self._add_place(f, g, centre)
 
