@@ -19,7 +19,8 @@ from trifix.kernels import joint as kernels
 from trifix.records import Fix, ReferenceMap, SensorPoints, TargetState
 
 _ALIVE = int(TargetState.trusted)
-_GROUP = 24  # targets that are put away together
+_GROUP = 16  # targets that are put away together
+_DEAR = 4.0  # β: what is put away pays so many times as much for lost correlations as what stays
 _RIDGE_MM2 = 1e-9  # so well is nothing known that is put away
 _FEWEST = 3  # blocks that hold a shift and a turn
 _NOBODY, _PLACE = -1, -2
@@ -235,7 +236,7 @@ class JointMap:
         """Targets become one place, of which only shift and turn stay correlated with what is held.
 
         Their errors are e = B f + ε: f is the best fit, uncorrelated with ε. Dropping X, the covariance of ε with the
-        rest, is paid for by [0 X; Xᵀ 0] ≤ [E 0; 0 Xᵀ E⁻¹ X], E that of ε; and E by its diagonal blocks times λ.
+        rest, is paid for by [0 X; Xᵀ 0] ≤ [β E 0; 0 Xᵀ E⁻¹ X / β], E that of ε; and E by its diagonal blocks times λ.
         """
         centre = self._xyz[rows].mean(axis=0)
         blocks = integers(self._block[rows])
@@ -244,7 +245,7 @@ class JointMap:
         used = self._used
         cov = kernels.condition(self._P, 0, blocks, ridge, B, np.zeros(len(B)), 0.0)[1]
         own = kernels.own_errors(self._P, blocks, ridge, B, cov)
-        _, cov, cross, _ = kernels.condition(self._P, used, blocks, ridge, B, np.zeros(len(B)), 1.0)
+        _, cov, cross, _ = kernels.condition(self._P, used, blocks, ridge, B, np.zeros(len(B)), 1.0 / _DEAR)
         for row, b in zip(rows.tolist(), blocks.tolist(), strict=True):
             self._vacate(b)
             self._block[row] = _NOBODY
@@ -254,7 +255,7 @@ class JointMap:
         self._P[place, :used] = cross
         self._P[:used, place] = cross.T
         self._P[np.ix_(place, place)] = cov
-        self._own[rows] = 2.0 * own
+        self._own[rows] = (1.0 + _DEAR) * own
         self._place[rows] = self._add_place(f, g, centre)
 
     def _add_place(self, f: int, g: int, centre: Float[np.ndarray, "3"]) -> int:
