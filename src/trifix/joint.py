@@ -282,6 +282,7 @@ class JointMap:
             self._vacate(int(self._block[row]))
         self._leave_place(row)
         self._block[row] = self._id[row] = _NOBODY
+        self._own[row] = 0.0
 
     def _take(self, owner: int) -> int:
         """An empty block for a target or a place."""
