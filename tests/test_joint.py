@@ -69,7 +69,9 @@ def strip(rng: np.random.Generator, n: int, apart_mm: float = 20.0) -> np.ndarra
 
 def along(world: np.ndarray, x_mm: float) -> tuple[np.ndarray, Pose]:
     """The targets within 150 mm of a place along the strip, and a sensor before it."""
-    return np.flatnonzero(np.abs(world[:, 0] - x_mm) < 150.0), Pose.exp(np.array([x_mm, 5.0, 0.0, 0.0, 0.0, 1e-3 * x_mm]))
+    return np.flatnonzero(np.abs(world[:, 0] - x_mm) < 150.0), Pose.exp(
+        np.array([x_mm, 5.0, 0.0, 0.0, 0.0, 1e-3 * x_mm])
+    )
 
 
 def there_and_back(walk: Walk, end_mm: float, steps: int) -> None:
@@ -202,7 +204,7 @@ def test_a_pose_that_single_dots_carry_owes_the_map_what_its_targets_share():
     rows = walk.row_of[targets]
     own = 1e-6 * np.eye(6)
     none = np.zeros(0, dtype=np.int64)
-    dots = SingleDots(np.zeros(len(rows), np.int64), none, rows, np.zeros(0))
+    dots = SingleDots(np.zeros(len(rows), np.int64), np.arange(len(rows)), rows, np.zeros(len(rows)))
     fix = Fix(walk.T_true, own, none, none, np.zeros(0), 1e-20, PositionedReason.few_points, single=dots)
     T, cov = walk.joint.settle(walk.map, points, fix)
     assert T is fix.T_world_sensor

@@ -143,6 +143,11 @@ class JointMap:
             self._xyz[row] = map.xyz_mm[row]
 
     @property
+    def unknowns(self) -> int:
+        """Rows of the covariance."""
+        return self._used
+
+    @property
     def _used(self) -> int:
         """Rows and columns of P that blocks have taken."""
         return 3 * len(self._row)
@@ -164,7 +169,8 @@ class JointMap:
         places, R, t = floats(map.xyz_mm[target]), floats(T.R), floats(T.t_mm)
         r, noise = kernels.residuals(places, floats(points.xyz_mm[point]), floats(points.cov_mm2[point]), R, t)
         H = kernels.pose_fields(places, R, t)
-        return kernels.condition(self._P, used, integers(self._block[target]), noise, H, r, -1.0)
+        delta, cov, cross, shift = kernels.condition(self._P, used, integers(self._block[target]), noise, H, r, -1.0)
+        return delta, cov, cross, shift
 
     def _shared(self, map: ReferenceMap, T: Pose, rows: Int[np.ndarray, "r"]) -> Float[np.ndarray, "6 6"]:
         """Covariance of δ that the errors of some targets make together, each counting alike."""
@@ -194,16 +200,9 @@ class JointMap:
 
     def _move(self, map: ReferenceMap, shift: Float[np.ndarray, "used"]) -> None:
         """Targets to where they are estimated to be: held ones each, those put away with their places."""
-        blocks = np.flatnonzero(self._row >= 0)
-        rows = self._row[blocks]
-        map.xyz_mm[rows] += shift.reshape(-1, 3)[blocks]
-        away = np.flatnonzero((self._place >= 0) & (self._id >= 0))
-        if len(away):
-            a = self._place[away]
-            lever = self._xyz[away] - self._centre[a]
-            by = shift.reshape(-1, 3)
-            map.xyz_mm[away] += by[self._shift[a]] + np.cross(by[self._turn[a]], lever)
-        self._xyz[: len(map)] = map.xyz_mm
+        k = len(map)
+        kernels.carry(map.xyz_mm, self._block[:k], self._place[:k], self._shift, self._turn, self._centre, shift)
+        self._xyz[:k] = map.xyz_mm
 
     def _recall(self, target: Int[np.ndarray, "c"]) -> None:
         """Targets that are seen again are held again."""
@@ -314,9 +313,7 @@ class JointMap:
 class Knowledge:
     """The pose of a frame that a map has learnt from, and what its error has to do with those of the targets."""
 
-    def __init__(
-        self, T_world_sensor: Pose, cov: Float[np.ndarray, "6 6"], cross: Float[np.ndarray, "6 cap"]
-    ) -> None:
+    def __init__(self, T_world_sensor: Pose, cov: Float[np.ndarray, "6 6"], cross: Float[np.ndarray, "6 cap"]) -> None:
         self.T_world_sensor = T_world_sensor
         """The pose."""
         self.cov = cov

@@ -161,7 +161,9 @@ class Positioner:
             elsewhere=elsewhere,
         )
 
-    def _told(self, island: Island | None, points: SensorPoints | None, fix: Fix | None, clock: Stopwatch) -> Fix | None:
+    def _told(
+        self, island: Island | None, points: SensorPoints | None, fix: Fix | None, clock: Stopwatch
+    ) -> Fix | None:
         """The fix as it is told, with all that its map owes to its beginning."""
         if island is None or points is None or fix is None:
             return None

@@ -63,9 +63,7 @@ def condition(
     H: Float[np.ndarray, "c3 6"],
     r: Float[np.ndarray, "c3"],
     gain: float,
-) -> tuple[
-    Float[np.ndarray, "6"], Float[np.ndarray, "6 6"], Float[np.ndarray, "6 used"], Float[np.ndarray, "used"]
-]:
+) -> tuple[Float[np.ndarray, "6"], Float[np.ndarray, "6 6"], Float[np.ndarray, "6 used"], Float[np.ndarray, "used"]]:
     """What r = −e + H δ − noise tells of the errors e of the seen blocks and of δ, of which nothing was known before.
 
     With S = P_seen + noise: δ's estimate and covariance M⁻¹ = (Hᵀ S⁻¹ H)⁻¹, its covariance with all errors, and their
@@ -169,6 +167,29 @@ def clear_block(P: Float[np.ndarray, "cap cap"], block: int) -> None:
 
 
 @njit(cache=True, nogil=True)
+def carry(
+    xyz: Float[np.ndarray, "k 3"],
+    block: Int[np.ndarray, "k"],
+    place: Int[np.ndarray, "k"],
+    first: Int[np.ndarray, "p"],
+    second: Int[np.ndarray, "p"],
+    centre: Float[np.ndarray, "p 3"],
+    shift: Float[np.ndarray, "used"],
+) -> None:
+    """Targets move by the estimate of their errors: those with a block by its own, others with their place."""
+    for k in range(len(xyz)):
+        if block[k] >= 0:
+            for a in range(3):
+                xyz[k, a] += shift[3 * block[k] + a]
+        elif place[k] >= 0:
+            f, g = 3 * first[place[k]], 3 * second[place[k]]
+            x, y, z = xyz[k] - centre[place[k]]
+            xyz[k, 0] += shift[f] + shift[g + 1] * z - shift[g + 2] * y
+            xyz[k, 1] += shift[f + 1] + shift[g + 2] * x - shift[g] * z
+            xyz[k, 2] += shift[f + 2] + shift[g] * y - shift[g + 1] * x
+
+
+@njit(cache=True, nogil=True)
 def own_errors(
     P: Float[np.ndarray, "cap cap"],
     group: Int[np.ndarray, "c"],
@@ -240,7 +261,7 @@ def _factor(A: Float[np.ndarray, "m m"]) -> None:
                 A[i, j] = s / A[j, j]
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, fastmath={"contract"})
 def _substitute(L: Float[np.ndarray, "m m"], W: Float[np.ndarray, "m n"], n: int) -> None:
     """W becomes L⁻¹ W; four rows of it at a time are taken off, as that spares memory."""
     for i in range(len(L)):
@@ -261,9 +282,9 @@ def _substitute(L: Float[np.ndarray, "m m"], W: Float[np.ndarray, "m n"], n: int
             row[j] *= a
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, fastmath={"contract"})
 def _add_square(P: Float[np.ndarray, "cap cap"], W: Float[np.ndarray, "m n"], n: int, gain: float) -> None:
-    """P += gain Wᵀ W in the first n rows and columns, of which n is a multiple of three; W's rows are of even number."""
+    """P += gain Wᵀ W in the first n rows and columns; n is a multiple of three, and W has an even number of rows."""
     for i in range(0, n, 3):
         p, q, r = P[i], P[i + 1], P[i + 2]
         for k in range(0, len(W), 2):
@@ -314,3 +335,4 @@ def warm_up() -> None:
     own_errors(P, rows, noise, H, pose_cov)
     enter_block(P, 12, 4, H[:3].copy(), pose_cov, np.zeros((6, 15)), cov[0])
     clear_block(P, 4)
+    carry(places, rows, rows, rows, rows, places.copy(), np.zeros(12))
