@@ -124,12 +124,12 @@ def test_what_is_held_equals_least_squares_over_all_frames():
 @pytest.mark.parametrize(("capacity", "least"), [(MANY, 0.8), (30, 0.3)])
 def test_poses_there_and_back_are_off_by_what_they_state(capacity, least):
     """Held, errors are as stated; put away and taken back, no larger, though covariances pay for what was dropped."""
-    trials, last, half = 40, [], []
+    trials, last, half = 20, [], []
     for k in range(trials):
         rng = np.random.default_rng([3, k])
         walk = Walk(strip(rng, 60), rng, capacity)
-        there_and_back(walk, 1000.0, 15)
-        half.append(walk.errors[13])
+        there_and_back(walk, 1000.0, 11)
+        half.append(walk.errors[9])
         last.append(walk.errors[-1])
     low, high = chi2_limits(6 * trials)
     for errors in (half, last):
@@ -138,7 +138,7 @@ def test_poses_there_and_back_are_off_by_what_they_state(capacity, least):
 
 def test_a_loop_that_closes_stays_consistent():
     """Once round a ring of targets, the ends meet within what the covariance allows for, and are corrected."""
-    trials, before, after = 30, [], []
+    trials, before, after = 16, [], []
     for k in range(trials):
         rng = np.random.default_rng([5, k])
         angle = 2 * np.pi * np.arange(48) / 48
