@@ -107,7 +107,7 @@ class MapIndex:
             map.xyz_mm,
             map.cov_mm2,
             map.view,
-            self._widest_mm2,
+            self._reckoned_mm2(map),
             max_sigmas,
             tolerance_mm,
             limit,
@@ -144,7 +144,9 @@ class MapIndex:
         Prefer ``local`` where targets lie close: this one looks at all pairs of targets that are no farther apart than
         the frame's triangles are long, and keeps them until the next change of the index.
         """
-        table = self._pairs_within(self._longest_mm(points, frame_triangles, max_sigmas, tolerance_mm), max_comparisons)
+        table = self._pairs_within(
+            self._longest_mm(points, map, frame_triangles, max_sigmas, tolerance_mm), max_comparisons
+        )
         if table is None:
             none = np.zeros((0, 3), dtype=np.int64)
             return Candidates(none, none, none[:, 0], 0, 0.0, is_cut=True)
@@ -157,7 +159,7 @@ class MapIndex:
             map.xyz_mm,
             map.cov_mm2,
             map.view,
-            self._widest_mm2,
+            self._reckoned_mm2(map),
             max_sigmas,
             tolerance_mm,
             limit,
@@ -198,15 +200,27 @@ class MapIndex:
         """Grows whenever something is indexed anew."""
         return self._version
 
+    def _reckoned_mm2(self, map: ReferenceMap) -> float:
+        """The largest trace of a target's covariance that look-ups reckon with, so that no vague target widens all.
+
+        A target four times as vague as most is found where it agrees as if it were not.
+        """
+        return min(self._widest_mm2, float(kernels.largest_usual_trace(self._store, map.cov_mm2)))
+
     def _longest_mm(
-        self, points: SensorPoints, triangles: Int[np.ndarray, "t 3"], max_sigmas: float, tolerance_mm: float
+        self,
+        points: SensorPoints,
+        map: ReferenceMap,
+        triangles: Int[np.ndarray, "t 3"],
+        max_sigmas: float,
+        tolerance_mm: float,
     ) -> float:
         """How far apart two targets can be that agree with a side of the frame's triangles."""
         if len(triangles) == 0:
             return 0.0
         corners = points.xyz_mm[triangles]
         longest = np.linalg.norm(corners - corners[:, [1, 2, 0]], axis=2).max()
-        widest_mm2 = np.trace(points.cov_mm2, axis1=1, axis2=2).max() + self._widest_mm2
+        widest_mm2 = np.trace(points.cov_mm2, axis1=1, axis2=2).max() + self._reckoned_mm2(map)
         return float(longest + tolerance_mm + max_sigmas * np.sqrt(2 * widest_mm2) + 2 * self._store.slack_mm)
 
     def _pairs_within(self, reach_mm: float, max_comparisons: int) -> kernels.PairTable | None:

@@ -475,6 +475,18 @@ def _typical_variance(store, cov):
     return 2 / 3 * total / max(count, 1)
 
 
+@njit(cache=True, nogil=True)
+def largest_usual_trace(store, cov):
+    """Sixteen times the median trace of the targets' covariances (mm²), from a sample of them."""
+    trace = np.empty(65)
+    count = 0
+    for r in range(0, len(store.id), len(store.id) // 64 + 1):
+        if store.id[r] >= 0:
+            trace[count] = cov[r, 0, 0] + cov[r, 1, 1] + cov[r, 2, 2]
+            count += 1
+    return 16 * np.median(trace[:count]) if count else 0.0
+
+
 # --- local triangles -------------------------------------------------------------------------------------------------
 
 
@@ -864,6 +876,7 @@ def warm_up() -> None:
     turns(frame, len(xyz))
     scene = (frame, xyz, cov, xyz, cov, view, 0.01, 3.0, 0.0, 9)
     match_local(store, *scene)
+    largest_usual_trace(store, cov)
     all_triangles(store)
     largest_evidence(store, xyz, smallest_variance(cov))
     start, _ = count_pairs(store.anchor, rows, 0, 100, 1.0, 9)
