@@ -16,6 +16,9 @@ MISS_RATES = np.array([0.02, 0.1, 0.3, 0.6, 0.9])
 MISS_WEIGHTS = np.array([0.4, 0.3, 0.2, 0.07, 0.03])
 """How common frames of each miss rate are taken to be: mostly nothing is hidden, seldom nearly everything."""
 
+_MANY, _LOOKS_PER_CELL = 200, 4
+"""Of so many hypotheses, only so many that lead to about the same pose get a look."""
+
 _FIRST_ASKED = 8
 """Neighbours that a hypothesis is asked for first: if none of them has a target where it should, no more are asked."""
 
@@ -935,6 +938,26 @@ def _look(h, R, t, P, point, target, near, frame, used, scene, used_target, grid
 
 
 @njit(cache=True, nogil=True)
+def _is_seen_often(R, t, centre, cell_mm, cells, looks):
+    """Whether enough poses near this one have been looked at; notes it otherwise in an open hash table of cells.
+
+    A cell is as wide as half the targets' spacing, and an eighth in every entry of two columns of R.
+    """
+    key = np.uint64(14695981039346656037)
+    for r in range(3):
+        x = R[r, 0] * centre[0] + R[r, 1] * centre[1] + R[r, 2] * centre[2] + t[r]
+        key = (key ^ np.uint64(np.int64(np.floor(2 * x / cell_mm)))) * np.uint64(1099511628211)
+        key = (key ^ np.uint64(np.int64(np.floor(8 * R[r, 0])))) * np.uint64(1099511628211)
+        key = (key ^ np.uint64(np.int64(np.floor(8 * R[r, 1])))) * np.uint64(1099511628211)
+    slot = np.int64(key >> np.uint64(20)) % len(cells)
+    while looks[slot] > 0 and cells[slot] != key:
+        slot = (slot + 1) % len(cells)
+    cells[slot] = key
+    looks[slot] += 1
+    return looks[slot] > _LOOKS_PER_CELL
+
+
+@njit(cache=True, nogil=True)
 def solve(
     R,
     t,
@@ -994,6 +1017,10 @@ def solve(
     no_dots = (dots[0][:0], dots[1][:0], dots[2][:0], dots[3][:0])
     score = np.full(h, -np.inf)
     order = np.empty(h, np.int64)
+    cells, looks = np.zeros(2 * h if h > _MANY else 0, np.uint64), np.zeros(2 * h if h > _MANY else 0, np.int64)
+    middle = np.zeros(3)
+    for p in range(n):
+        middle += xyz[p] / n
     waiting = 0
     looked = 0
     B, D = np.empty((3, 3)), np.empty((3, 3))
@@ -1017,6 +1044,8 @@ def solve(
             if is_known:
                 continue
             if c:
+                if h > _MANY and _is_seen_often(R[a], t[a], middle, cell_mm, cells, looks):
+                    continue
                 looked += 1
                 asked, found, passed = _look(
                     a, R, t, P, point, target, near, frame, used, scene, used_target, grid, gate, look, stamp, log_ratio

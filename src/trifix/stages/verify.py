@@ -193,7 +193,8 @@ def verify(
             f"by chance so in up to {best.p_chance:.1e} of such frames."
         )
         return NoFix(Reason.not_proven, detail, best.p_chance, len(best.point), best.rms_mm)
-    found += weighed.rivals(found, best)
+    others, is_cut = weighed.rivals(found, best)
+    found += others
     best = max(found, key=lambda each: each.log_likelihood)
     rivals = [each for each in found if each is not best and weighed.is_rival(best, each)]
     if rivals or best.p_chance > options.max_p_chance:
@@ -202,6 +203,9 @@ def verify(
         explained = ", ".join(str(each.matched) for each in told[:4])
         detail = f"{len(told)} poses explain {explained} points."
         return NoFix(Reason.ambiguous, detail, best.p_chance, len(best.point), best.rms_mm, told)
+    if is_cut:
+        detail = f"More than {options.max_rivals} places would have to be searched for other poses that explain it."
+        return NoFix(Reason.out_of_time, detail, best.p_chance, len(best.point), best.rms_mm)
     if weighed.is_mirror_image(best):
         detail = f"{len(best.point)} points agree with the map; in a mirror more would."
         return NoFix(Reason.not_proven, detail, 1.0, len(best.point), best.rms_mm)
@@ -355,8 +359,8 @@ class _Weighed:
         area_mm2 = self._index.targets * float(np.mean(spacing_mm**2))
         return motion_log_ratio(T_world_sensor, self._prediction, area_mm2)
 
-    def rivals(self, found: list[Solution], best: Solution) -> list[Solution]:
-        """Solutions that could come too near the best one, beside those that have been found.
+    def rivals(self, found: list[Solution], best: Solution) -> tuple[list[Solution], bool]:
+        """Solutions that could come too near the best one, beside those found; and whether not all were looked at.
 
         Whatever pose explains m points of the frame explains three of one group, if the points are parted into groups
         of which there are fewer than m / 2: so a few triples find every pose that can come near enough.
@@ -366,10 +370,10 @@ class _Weighed:
         by_odds = int(np.ceil(least / self._index.largest_evidence(points, self._map)))
         needed = max(3, min(int(np.ceil(options.max_rival_share * len(best.point))), by_odds))
         if len(points) < needed:
-            return []
-        candidates = self._congruent(needed)
+            return [], False
+        candidates, is_cut = self._congruent(needed)
         if len(candidates) == 0:
-            return []
+            return [], is_cut
         hypotheses = Identification(
             candidates.point, candidates.target, candidates.tried, candidates.expected_by_chance
         )
@@ -383,17 +387,23 @@ class _Weighed:
                 candidates.target,
             )
         )
-        return self.candidates(hypotheses, orientations, (), np.inf, needed, found)
+        return self.candidates(hypotheses, orientations, (), np.inf, needed, found), is_cut
 
-    def _congruent(self, needed: int) -> Candidates:
-        """Where in the map a pose that explains so many points can lie; of what is large, among near targets only."""
+    def _congruent(self, needed: int) -> tuple[Candidates, bool]:
+        """Where in the map a pose that explains so many points can lie, and whether the search was cut.
+
+        In what is large, near targets have to do.
+        """
         points, limits = self._evidence.points, (self._options.gate_sigmas, 0.0, self._options.max_rivals)
         groups = max(1, (needed - 1) // 2)
         size = len(points) / groups
         is_small = groups * size**3 / 6 <= _TRIPLES and self._index.targets <= ANYWHERE_UP_TO
         if is_small:
-            return self._index.any(points, self._map, kernels.covering_triples(points.xyz_mm, needed), *limits)
-        return self._index.local(points, self._map, frame_triangles(points.xyz_mm, points.cov_mm2, 6), *limits)
+            triples = kernels.covering_triples(points.xyz_mm, needed)
+            found = self._index.any(points, self._map, triples, *limits)
+            return found, found.is_cut or found.tried < len(triples)
+        near = frame_triangles(points.xyz_mm, points.cov_mm2, 6)
+        return self._index.local(points, self._map, near, *limits), False
 
     def is_rival(self, best: Solution, other: Solution) -> bool:
         """Whether another solution puts the points elsewhere and yet comes too near the best in explaining them.
