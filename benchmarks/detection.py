@@ -98,7 +98,7 @@ def coverage(
     n = int(40 * half / min(1.0, 3 * blur_px)) + 60
     angle = (np.arange(n) + 0.5) * np.pi / n
     x = half * np.cos(angle)
-    # Form E of the ellipse; its chord at x has its middle at E_uv / E_uu x and half-length √(det E / E_uu (1 - x²/E_uu)).
+    # Form E of the ellipse; the chord at x has its middle at E_uv / E_uu x, half-length √(det E / E_uu (1 - x²/E_uu)).
     slope = (a**2 - b**2) * np.sin(theta) * np.cos(theta) / half**2
     length = a * b / half * np.sin(angle)
     weight = half * np.sin(angle) * np.pi / n
@@ -207,7 +207,7 @@ def errors(image: np.ndarray, truth: np.ndarray, options: DetectOptions) -> tupl
 def searched(name: str, images: int) -> tuple[str, ...]:
     """Dots, share found, false ones per 100 images, rms error and median time of one kind of scene."""
     true, found, false, squares, ms = 0, 0, 0, [], []
-    for image, uv in scenes(name, images):
+    for image, uv, drawn in scenes(name, images):
         start = perf_counter()
         dots = detect(image)
         ms.append(1e3 * (perf_counter() - start))
@@ -217,7 +217,7 @@ def searched(name: str, images: int) -> tuple[str, ...]:
         distance = np.hypot(*(uv[:, None] - dots.uv_px[None]).transpose(2, 0, 1))
         hit = distance.min(axis=1, initial=np.inf) < 1.0
         true, found = true + len(uv), found + int(hit.sum())
-        false += int((distance.min(axis=0, initial=np.inf) > 3.0).sum())
+        false += int((np.hypot(*(drawn[:, None] - dots.uv_px[None]).transpose(2, 0, 1)).min(axis=0) > 3.0).sum())
         squares.append(distance.min(axis=1, initial=np.inf)[hit] ** 2)
     rms = float(np.sqrt(np.mean(np.concatenate(squares)))) if squares else np.nan
     share = 100 * found / true if true else np.nan
@@ -225,15 +225,16 @@ def searched(name: str, images: int) -> tuple[str, ...]:
 
 
 def scenes(name: str, images: int):  # type: ignore[no-untyped-def]
-    """Images and the true centres in them."""
+    """Images, the true centres of the dots to be found, and all that are drawn, be they too oblique or cut off."""
     rng = np.random.default_rng(1)
     for k in range(images):
         if name == "sizes":
-            yield all_sizes(rng)
+            image, uv = all_sizes(rng)
+            yield image, uv, uv
         elif name == "correlated noise":
             noise = cv2.GaussianBlur(rng.standard_normal((1024, 1280)), (0, 0), rng.uniform(0.5, 1.5))
             image = 100 + rng.uniform(3, 15) * noise / noise.std()
-            yield np.clip(np.rint(image), 0, 255).astype(np.uint8), np.zeros((0, 2))
+            yield np.clip(np.rint(image), 0, 255).astype(np.uint8), np.zeros((0, 2)), np.zeros((0, 2))
         elif k == 0:
             made = simulate_frames(name, 0, "images", images)
             scene = replace(made.scene, sensing=replace(made.scene.sensing, ghosts_per_image=0.0))
@@ -245,11 +246,12 @@ def scenes(name: str, images: int):  # type: ignore[no-untyped-def]
                 h, w = image.shape
                 uv, d = seen.uv_px[rows], seen.diameter_px[rows]
                 whole = (np.minimum(uv, [w - 1, h - 1] - uv) > d[:, None]).all(axis=1)
-                yield image, uv[whole & (d >= 5)]
+                in_camera = made.truth.frames.T_map_sensor[i].inverse().apply(scene.targets.xyz_mm)
+                yield image, uv[whole & (d >= 5)], scene.rig.left.project(in_camera[in_camera[:, 2] > 1])
 
 
 def all_sizes(rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
-    """Dots of 5 to 200 px, tilted to 65°, on stickers on a textured ground in uneven light, dark ones or bright ones."""
+    """Dots of 5 to 200 px, tilted to 65°, dark or bright, on stickers on a textured ground in uneven light."""
     h, w = 1024, 1280
     ground = np.zeros((h, w))
     for scale_px in (1, 2, 4, 8, 16, 32):

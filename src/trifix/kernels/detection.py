@@ -34,7 +34,8 @@ _BLUR_PX = 0.8
 _MIN_BLUR_PX = 0.29  # the pixel's own aperture: 1/sqrt(12)
 _QUANTISATION_VARIANCE = 1.0 / 12.0
 _ALIASING_PX2 = 0.013**2
-_MAX_START = 0.4
+_MIN_FILL = 0.75  # area of a blob in areas of the ellipse of its moments; small dots lose a quarter to their pixels
+_MAX_START = 0.4  # rms residual of a fit worth beginning, in steps
 _ENOUGH = 160  # pixels for the first, rough fit
 
 
@@ -128,19 +129,19 @@ def blobs(
                 latest = s
         start = n
         latest, reached = 0, -1  # sign of the open run, and where it has come to
-        for m in range(pieces):
-            if begin[m] != reached:
+        for piece in range(pieces):
+            if begin[piece] != reached:
                 latest = 0
-            reached = end[m]
-            if side[m] != 2:
-                if side[m] != latest:
-                    row[n], first[n], parent[n], sign[n] = v, begin[m], n, side[m]
+            reached = end[piece]
+            if side[piece] != 2:
+                if side[piece] != latest:
+                    row[n], first[n], parent[n], sign[n] = v, begin[piece], n, side[piece]
                     n += 1
-                    latest = side[m]
+                    latest = side[piece]
                 last[n - 1] = reached - 1
                 continue
-            t = threshold[m]
-            for u in range(begin[m], end[m]):
+            t = threshold[piece]
+            for u in range(begin[piece], end[piece]):
                 s = 1 if 2 * int(image[v, u]) > t else -1
                 if s != latest:
                     row[n], first[n], parent[n], sign[n] = v, u, n, s
@@ -202,8 +203,7 @@ def blobs(
         spread = sqrt(0.25 * (uu - vv) ** 2 + uv * uv)
         minor, major = 0.5 * (uu + vv) - spread, 0.5 * (uu + vv) + spread
         fill = area / (4 * pi * sqrt(det))
-        # What pixels take away from an ellipse shrinks with their number.
-        if minor < min_axis_ratio * min_axis_ratio * major or fill < max(0.74, 0.94 - 0.9 / sqrt(area)):
+        if minor < min_axis_ratio * min_axis_ratio * major or fill < _MIN_FILL:
             continue
         if 4 * sqrt(major) < min_length_px - 0.7:
             continue
