@@ -30,7 +30,7 @@ from trifix.records import (
     SensorPoints,
     StereoMatches,
 )
-from trifix.stages.identify import AS_PREDICTED, any_triangles, identifier
+from trifix.stages.identify import AS_PREDICTED, any_triangles, identifier, pairs_as_predicted
 from trifix.stages.orient import orient
 from trifix.stages.predict import Motion, follow, predict
 from trifix.stages.tend import Care, Hand
@@ -101,7 +101,8 @@ class Island:
                 detail = f"{number} hypotheses were tried, and at most {budget} are. {best.detail}".strip()
                 return likeliest, replace(best, why=Reason.out_of_time, detail=detail)
         if evidence.dots is not None and likeliest is not None:
-            for portion in {id(each): each for each in (likeliest, tried[0])}.values():
+            by_motion = [each for each in tried if each.point.shape[1] < 3]
+            for portion in {id(each): each for each in (likeliest, *by_motion)}.values():
                 others = [each for each in tried if each is not portion]
                 fix = self._judge(evidence, portion, others, prediction, clock, asks_dots=True)
                 if isinstance(fix, Fix):
@@ -110,9 +111,11 @@ class Island:
 
     def _hypotheses(self, points: SensorPoints, prediction: Prediction | None) -> Iterator[Identification]:
         """Where the motion leads, first; then from nothing: those of the technique, and then any triangle at all."""
-        options = self._config.identify
+        options, gate = self._config.identify, self._config.verify.gate_sigmas
         if prediction is not None and options.start != "nothing" and self._config.verify.method == "probability":
             yield AS_PREDICTED
+            if 0 < len(points) < 3:
+                yield pairs_as_predicted(points, self.map, prediction.turned or prediction, gate)
         if options.start == "prediction" or len(points) < 3:
             return
         yield from self.identifier.identify(points, self.map, self.motion.newest if self.motion else None)
@@ -131,6 +134,8 @@ class Island:
     ) -> Fix | NoFix:
         """Hypotheses to poses to the one that is proven, by the method that the options name."""
         options, points = self._config.verify, evidence.points
+        if prediction is not None and 0 < identification.point.shape[1] < 3:
+            prediction = prediction.turned or prediction
         with clock("orient"):
             orientations = orient(points, self.map, identification, prediction)
         with clock("verify"):

@@ -303,6 +303,8 @@ class Prediction:
     """The pose."""
     cov: Float[np.ndarray, "6 6"]
     """Covariance of δ = (translation mm, rotation rad), T_true = T · exp(δ)."""
+    turned: "Prediction | None" = None
+    """The same if the sensor has turned off its way: as fast as before, in any direction."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -1122,7 +1122,7 @@ def solve(
         pairs = 0
         for p in range(n):
             pairs += matched[p] >= 0
-        if pairs < needed or (pairs < 3 and c):
+        if pairs < needed or (pairs < 3 and c >= 3):
             continue
         asked_dots = dots if asks_dots else no_dots
         info = prior[2] if pairs < 3 else np.zeros((6, 6))
@@ -1146,7 +1146,7 @@ def solve(
         pairs = 0
         for p in range(n):
             pairs += matched[p] >= 0
-        if (pairs < 3 and c) or pairs < needed:
+        if (pairs < 3 and c >= 3) or pairs < needed:
             continue
         asked_targets = dot_target if asks_dots else dot_target[:0]
         missed = _log_missed(Rs, ts, frame, scene, matched, asked_targets, windows, 0.25 * cell_mm, is_marked)

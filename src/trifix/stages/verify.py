@@ -293,8 +293,8 @@ class _Weighed:
         for k in range(s):
             T, point = Pose(R[k], t[k]), np.flatnonzero(matched[k] >= 0)
             gain = self._motion_gain(T, spacing[k, point])
-            # a hypothesis that names no pairs is the motion itself: it has been counted
-            evidence = log_ratio[k] + (gain if identification.point.shape[1] else 0.0)
+            # a hypothesis of fewer than three pairs rests on the motion itself: it has been counted
+            evidence = log_ratio[k] + (gain if identification.point.shape[1] >= 3 else 0.0)
             p_chance = self._p_chance(evidence, matched[k], identification, earlier)
             solutions.append(
                 Solution(
@@ -346,6 +346,9 @@ class _Weighed:
         If tolerances were k times as wide, chance would bring k³ times as many, and the true ones would hardly count.
         """
         points = self._evidence.points
+        every = [each for each in every if each.point.shape[1] == 3]
+        if not every:
+            return np.inf
         triangles = np.unique(np.sort(np.concatenate([each.point for each in every]), axis=1), axis=0)[:_SAMPLE]
         looked_up = sum(max(each.comparisons, len(each)) for each in every)
         search = self._index.any if self._index.targets <= ANYWHERE_UP_TO else self._index.local
