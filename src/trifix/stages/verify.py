@@ -146,6 +146,7 @@ class Solution:
 _QUICK_NEIGHBOURS = 12  # of each of the three points, for the first look
 _CARRIED_OFF = 1e-3  # ε: probability that the sensor is not where its motion leads
 _WORKED_OUT = 6  # solutions in search of the best one
+_DEPTH_MARGIN = 0.15  # a sensor sees somewhat farther, and nearer, than any one frame shows
 _MARGIN_PX = 10.0  # nearer to the image's edge a target may well go unseen
 _WINDOW_POINTS = 4  # of given points, to say what the sensor's field of view is
 _WIDER, _SAMPLE = 6.0, 12  # tolerances so much wider, for so many triangles, tell what chance would bring
@@ -522,12 +523,13 @@ def pose_sigma(cov: Float[np.ndarray, "6 6"], xyz_mm: Float[np.ndarray, "c 3"]) 
 def _windows(evidence: Evidence) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Where a target must be to be seen: for each camera its rotation, its translation, limits of slopes and depth.
 
-    Without a rig the slopes and depths that the frame's points fill stand for the field of view.
+    The depths that the frame's points fill, and somewhat more, stand for the sensor's; without a rig, their slopes stand
+    for the field of view.
     """
     xyz = evidence.points.xyz_mm
     if len(xyz) < _WINDOW_POINTS:
         return np.zeros((0, 3, 3)), np.zeros((0, 3)), np.zeros((0, 6))
-    near_mm, far_mm = xyz[:, 2].min(), xyz[:, 2].max()
+    near_mm, far_mm = (1 - _DEPTH_MARGIN) * xyz[:, 2].min(), (1 + _DEPTH_MARGIN) * xyz[:, 2].max()
     if evidence.rig is None:
         slope = xyz[:, :2] / xyz[:, 2:]
         low, high = slope.min(axis=0), slope.max(axis=0)
