@@ -18,6 +18,7 @@ ANYWHERE_UP_TO = 300
 _ALIVE = int(TargetState.trusted)  # states up to this one are indexed
 _SAMPLE = 64  # targets from which the spacing is judged
 _SPACING_RATIO = 1.5  # a spacing that is off by more is corrected
+_STEPS_PER_CELL = 96  # of distance, to one cell of space
 _SLACK_CELLS = 1 / 800  # of a cell's width: what a target moves by once it was seen a few times
 _FLOAT32_STEP = 2.0**-22  # anchors must not leave their slack by rounding
 
@@ -226,17 +227,18 @@ class MapIndex:
     def _pairs_within(self, reach_mm: float, max_comparisons: int) -> kernels.PairTable | None:
         """All pairs of targets up to this distance, None where there are too many to compare."""
         store = self._store
-        steps = int(reach_mm / store.side_mm) + 1
+        step_mm = store.cell_mm / _STEPS_PER_CELL
+        steps = int(reach_mm / step_mm) + 1
         if self._pairs and self._pairs[0] == self._version and len(self._pairs[1].start) > steps:
             return self._pairs[1]
         self._pairs = None
         rows = np.flatnonzero(store.id >= 0)
         axis = int(np.argmax(np.ptp(store.anchor[rows], axis=0))) if len(rows) else 0
         rows = rows[np.argsort(store.anchor[rows, axis], kind="stable")]
-        start, compared = kernels.count_pairs(store.anchor, rows, axis, steps, store.side_mm, max_comparisons)
+        start, compared = kernels.count_pairs(store.anchor, rows, axis, steps, step_mm, max_comparisons)
         if compared > max_comparisons:
             return None
-        self._pairs = self._version, kernels.list_pairs(store.anchor, rows, axis, start, store.side_mm)
+        self._pairs = self._version, kernels.list_pairs(store.anchor, rows, axis, start, step_mm)
         return self._pairs[1]
 
     def _make_room(self, rows: int) -> None:
@@ -247,7 +249,7 @@ class MapIndex:
         grown = kernels.new_store(max(rows, cap + cap // 2), 0, store.cell_mm, store.slack_mm)
         for old, new in zip(store[:5], grown[:5], strict=True):  # what has an entry or several a row
             new[: len(old)] = old
-        self._store = grown._replace(cell_head=store.cell_head, side_head=store.side_head)
+        self._store = grown._replace(cell_head=store.cell_head, side_head=store.side_head, side_mm=store.side_mm)
 
     def _build(self, map: ReferenceMap) -> None:
         """Indexes everything anew, on scales that suit the map."""

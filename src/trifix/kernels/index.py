@@ -17,7 +17,8 @@ PAIRS = 28
 """Pairs of eight neighbours: the triangles that one target may own."""
 
 _REACH_CELLS = 4  # neighbours are sought within so many cells
-_SIDE_CELLS = 96.0  # cells of sides to one of space: few triangles in each, few cells to a look-up
+_SIDE_CELLS = 3.2  # cells of sides to one of space, times the cube root of the targets: a few triangles in each
+_FEWEST_SIDE_CELLS, _MOST_SIDE_CELLS = 16.0, 128.0
 _SLENDER = 0.15  # triangles whose altitude is a smaller part of their longest side are left out
 _EDGE_ON_SINE = 0.34202014332566873  # sin 20°: nearer to edge-on the handedness of a triangle is not trusted
 _ORDERS = np.array([[0, 1, 2], [1, 2, 0], [2, 0, 1], [0, 2, 1], [2, 1, 0], [1, 0, 2]])  # even ones first
@@ -63,7 +64,7 @@ def new_store(cap: int, targets: int, cell_mm: float, slack_mm: float) -> Store:
             cell_head=np.zeros(0, dtype=np.int32),
             side_head=np.zeros(0, dtype=np.int32),
             cell_mm=cell_mm,
-            side_mm=cell_mm / _SIDE_CELLS,
+            side_mm=cell_mm / _FEWEST_SIDE_CELLS,
             slack_mm=slack_mm,
         ),
         targets,
@@ -73,7 +74,12 @@ def new_store(cap: int, targets: int, cell_mm: float, slack_mm: float) -> Store:
 def with_empty_tables(store: Store, targets: int) -> Store:
     """The same rows with tables of a size for about so many targets, and nothing in them."""
     size = 1 << max(targets, 8).bit_length()
-    return store._replace(cell_head=np.full(size, -1, dtype=np.int32), side_head=np.full(4 * size, -1, dtype=np.int32))
+    cells = min(max(_SIDE_CELLS * targets ** (1 / 3), _FEWEST_SIDE_CELLS), _MOST_SIDE_CELLS)
+    return store._replace(
+        cell_head=np.full(size, -1, dtype=np.int32),
+        side_head=np.full(4 * size, -1, dtype=np.int32),
+        side_mm=store.cell_mm / cells,
+    )
 
 
 # --- small parts -----------------------------------------------------------------------------------------------------
