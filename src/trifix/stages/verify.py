@@ -367,7 +367,7 @@ class _Weighed:
         needed = max(3, min(int(np.ceil(options.max_rival_share * len(best.point))), by_odds))
         if len(points) < needed:
             return []
-        candidates = self._congruent(needed)
+        candidates = self._congruent(needed, best)
         if len(candidates) == 0:
             return []
         hypotheses = Identification(
@@ -385,15 +385,23 @@ class _Weighed:
         )
         return self.candidates(hypotheses, orientations, (), np.inf, needed, found)
 
-    def _congruent(self, needed: int) -> Candidates:
-        """Where in the map a pose that explains so many points can lie; of what is large, among near targets only."""
+    def _congruent(self, needed: int, best: Solution) -> Candidates:
+        """Where in the map a pose that explains so many points can lie; of what is large, among near targets only.
+
+        Near ones are sought among the points that the best one explains, too: a look-alike explains the same, and
+        points that are no targets may lie between them.
+        """
         points, limits = self._evidence.points, (self._options.gate_sigmas, 0.0, self._options.max_rivals)
         groups = max(1, (needed - 1) // 2)
         size = len(points) / groups
         is_small = groups * size**3 / 6 <= _TRIPLES and self._index.targets <= ANYWHERE_UP_TO
         if is_small:
             return self._index.any(points, self._map, kernels.covering_triples(points.xyz_mm, needed), *limits)
-        return self._index.local(points, self._map, frame_triangles(points.xyz_mm, points.cov_mm2, 6), *limits)
+        p, near = best.point, frame_triangles(points.xyz_mm, points.cov_mm2, 6)
+        own = p[frame_triangles(points.xyz_mm[p], points.cov_mm2[p], _QUICK_NEIGHBOURS)]
+        triangles = np.concatenate([own, near])
+        first = np.unique(np.sort(triangles, axis=1), axis=0, return_index=True)[1]
+        return self._index.local(points, self._map, triangles[np.sort(first)], *limits)
 
     def is_rival(self, best: Solution, other: Solution) -> bool:
         """Whether another solution puts the points elsewhere and yet comes too near the best in explaining them.
