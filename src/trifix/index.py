@@ -212,12 +212,13 @@ class MapIndex:
     def _pairs_within(self, reach_mm: float, max_comparisons: int) -> kernels.PairTable | None:
         """All pairs of targets up to this distance, None where there are too many to compare."""
         store = self._store
-        steps = int(reach_mm / store.side_mm) + 1
+        rows = np.flatnonzero(store.id >= 0)
+        size_mm = np.ptp(store.anchor[rows], axis=0) if len(rows) else np.zeros(3)
+        steps = int(min(reach_mm, float(np.linalg.norm(size_mm))) / store.side_mm) + 2  # no two are farther apart
         if self._pairs and self._pairs[0] == self._version and len(self._pairs[1].start) > steps:
             return self._pairs[1]
         self._pairs = None
-        rows = np.flatnonzero(store.id >= 0)
-        axis = int(np.argmax(np.ptp(store.anchor[rows], axis=0))) if len(rows) else 0
+        axis = int(np.argmax(size_mm))
         rows = rows[np.argsort(store.anchor[rows, axis], kind="stable")]
         start, compared = kernels.count_pairs(store.anchor, rows, axis, steps, store.side_mm, max_comparisons)
         if compared > max_comparisons:
