@@ -4,7 +4,8 @@ A pose is accepted when the agreement of the *whole* frame with the map cannot b
 explains the frame about as well: never because three residuals are small. The evidence is a likelihood ratio whose
 mean is at most one for a wrong pose, so that by Markov's inequality its inverse, times the number of false hypotheses
 to be reckoned with, bounds the probability of accepting a wrong one. The three points that made the hypothesis count in
-that number alone: a triangle that chance would seldom match needs less confirmation. The last motion is evidence too.
+that number, as a triangle that chance would seldom match needs less confirmation, and by how well their sides agree.
+The last motion is evidence too, and so are targets that should be seen and are not.
 """
 
 from collections.abc import Sequence
