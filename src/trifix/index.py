@@ -228,12 +228,13 @@ class MapIndex:
         """All pairs of targets up to this distance, None where there are too many to compare."""
         store = self._store
         step_mm = store.cell_mm / _STEPS_PER_CELL
-        steps = int(reach_mm / step_mm) + 1
+        rows = np.flatnonzero(store.id >= 0)
+        size_mm = np.ptp(store.anchor[rows], axis=0) if len(rows) else np.zeros(3)
+        steps = int(min(reach_mm, float(np.linalg.norm(size_mm))) / step_mm) + 2  # no two are farther apart
         if self._pairs and self._pairs[0] == self._version and len(self._pairs[1].start) > steps:
             return self._pairs[1]
         self._pairs = None
-        rows = np.flatnonzero(store.id >= 0)
-        axis = int(np.argmax(np.ptp(store.anchor[rows], axis=0))) if len(rows) else 0
+        axis = int(np.argmax(size_mm))
         rows = rows[np.argsort(store.anchor[rows, axis], kind="stable")]
         start, compared = kernels.count_pairs(store.anchor, rows, axis, steps, step_mm, max_comparisons)
         if compared > max_comparisons:

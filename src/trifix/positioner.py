@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import assert_never
 
 import numpy as np
-from jaxtyping import Int
+from jaxtyping import Bool, Int
 
 from trifix.config import Config
 from trifix.errors import MapError
@@ -53,6 +53,9 @@ from trifix.stages.weigh import (
 )
 
 _HERE_PERHAPS = 1e-3  # no part of the object is new where what is known agrees so well
+_FARTHEST_MM = 1e6  # no point lies, and no error reaches, a kilometre off
+_LEAST_VARIANCE_MM2 = 1e-12  # a nanometre: nothing is known better
+_LEAST_VARIANCE_SHARE = 1e-12  # of the largest along another axis
 _COULD_BE_ELSEWHERE = (Reason.no_candidate, Reason.not_proven, Reason.out_of_time)
 
 
@@ -76,7 +79,7 @@ class Positioner:
         """Scale of the noise at which the newest frame's pairs were sought."""
         if is_map_frozen and (map is None or not map.alive.any()):
             raise MapError("A frozen map without targets was given: nothing could ever be found on it.")
-        self._world = Island(0, self.config, stored(map or ReferenceMap.empty()), is_map_frozen)
+        self._world = Island(0, self.config, stored(_checked(map or ReferenceMap.empty())), is_map_frozen)
         self._next_id = int(self.map.id.max(initial=-1)) + 1
         self._last_ns = -(1 << 63)
         self._islands: list[Island] = []
@@ -108,7 +111,7 @@ class Positioner:
         if frame.timestamp_ns < self._last_ns:
             frame = _reversed(frame, self._last_ns)
         elif isinstance(frame.content, SensorPoints):
-            frame = _finite(frame, frame.content)
+            frame = _usable(frame, frame.content)
         self._last_ns = max(self._last_ns, frame.timestamp_ns)
         return self._judge(frame, learns=True)
 
@@ -439,13 +442,43 @@ def _reversed(frame: Frame, last_ns: int) -> Frame:
     return Frame(frame.index, frame.timestamp_ns, frame.rig, Unusable(Reason.time_reversed, detail))
 
 
-def _finite(frame: Frame, points: SensorPoints) -> Frame:
-    """The same frame, refused where a point is not a number."""
-    bad = ~(np.isfinite(points.xyz_mm).all(axis=1) & np.isfinite(points.cov_mm2).all(axis=(1, 2)))
-    if not bad.any():
-        return frame
-    detail = f"{bad.sum()} of {len(points)} points are not finite, the first in row {points.row[np.argmax(bad)]}."
+def _usable(frame: Frame, points: SensorPoints) -> Frame:
+    """The same frame, refused where a point is not a number, beyond all reach, or has no covariance to weigh it by."""
+    finite = np.isfinite(points.xyz_mm).all(axis=1) & np.isfinite(points.cov_mm2).all(axis=(1, 2))
+    if not finite.all():
+        return _refused(frame, points, ~finite, "are not finite")
+    is_far = np.abs(points.xyz_mm).max(axis=1, initial=0.0) > _FARTHEST_MM
+    if is_far.any():
+        return _refused(frame, points, is_far, f"are farther off than {_FARTHEST_MM:g} mm")
+    transposed = points.cov_mm2.transpose(0, 2, 1)
+    low, _, high = np.linalg.eigvalsh(0.5 * (points.cov_mm2 + transposed)).T
+    is_none = (low < _LEAST_VARIANCE_MM2) | (low < _LEAST_VARIANCE_SHARE * high) | (high > _FARTHEST_MM**2)
+    is_none |= np.abs(points.cov_mm2 - transposed).max(axis=(1, 2), initial=0.0) > _LEAST_VARIANCE_SHARE * high
+    if is_none.any():
+        return _refused(frame, points, is_none, "have a covariance that is singular, negative or out of all bounds")
+    return frame
+
+
+def _refused(frame: Frame, points: SensorPoints, bad: Bool[np.ndarray, "n"], what: str) -> Frame:
+    detail = f"{bad.sum()} of {len(points)} points {what}, the first in row {points.row[np.argmax(bad)]}."
     return replace(frame, content=Unusable(Reason.bad_points, detail))
+
+
+def _checked(map: ReferenceMap) -> ReferenceMap:
+    """The map, if its targets are somewhere.
+
+    Raises:
+        MapError: a target's place or covariance is not finite, or its covariance has a negative variance.
+    """
+    alive = map.rows(np.flatnonzero(map.alive))
+    finite = np.isfinite(alive.xyz_mm).all(axis=1) & np.isfinite(alive.cov_mm2).all(axis=(1, 2))
+    if not finite.all():
+        raise MapError(f"Target {alive.id[np.argmin(finite)]} of the map given holds a value that is not finite.")
+    least = np.linalg.eigvalsh(alive.cov_mm2)[:, 0]
+    negative = least < -1e-6 * np.abs(alive.cov_mm2).max(axis=(1, 2), initial=0.0)  # 1e-6: as printed in files
+    if negative.any():
+        raise MapError(f"The covariance of target {alive.id[np.argmax(negative)]} of the map given is none.")
+    return map
 
 
 def _across(link: Prediction | None, T: Pose, is_to_world: bool) -> Prediction | None:

@@ -23,7 +23,7 @@ class Reason(Enum):
 
     unreadable_image = "An image of this frame cannot be read."
     no_calibration = "No calibration is known for this frame."
-    bad_points = "The frame holds values that are not finite numbers."
+    bad_points = "The frame holds values that are not finite numbers, or out of all bounds."
     time_reversed = "The frame is older than the one before it."
     too_few_points = "Fewer than three points were seen by both cameras."
     no_candidate = "No constellation of the frame resembles one in the map."

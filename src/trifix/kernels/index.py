@@ -716,6 +716,8 @@ def match_any(
         wide = 4 * reach  # chance is judged from third sides that miss by up to so much
         low, high = max(int((length[2] - reach) / table.step_mm), 0), int((length[2] + reach) / table.step_mm)
         low1, high1 = max(int((length[1] - reach) / table.step_mm), 0), int((length[1] + reach) / table.step_mm)
+        if low >= steps:  # no two targets are so far apart
+            continue
         high, high1 = min(high, steps - 1), min(high1, steps - 1)
         met = 0
         for m in range(table.start[low], table.start[high + 1]):

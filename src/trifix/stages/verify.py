@@ -4,7 +4,8 @@ A pose is accepted when the agreement of the *whole* frame with the map cannot b
 explains the frame about as well: never because three residuals are small. The evidence is a likelihood ratio whose
 mean is at most one for a wrong pose, so that by Markov's inequality its inverse, times the number of false hypotheses
 to be reckoned with, bounds the probability of accepting a wrong one. The three points that made the hypothesis count in
-that number alone: a triangle that chance would seldom match needs less confirmation. The last motion is evidence too.
+that number, as a triangle that chance would seldom match needs less confirmation, and by how well their sides agree.
+The last motion is evidence too, and so are targets that should be seen and are not.
 """
 
 from collections.abc import Sequence
@@ -375,7 +376,7 @@ class _Weighed:
         needed = max(3, min(int(np.ceil(options.max_rival_share * len(best.point))), by_odds))
         if len(points) < needed:
             return [], False
-        candidates, is_cut = self._congruent(needed)
+        candidates, is_cut = self._congruent(needed, best)
         if len(candidates) == 0:
             return [], is_cut
         hypotheses = Identification(
@@ -393,10 +394,11 @@ class _Weighed:
         )
         return self.candidates(hypotheses, orientations, (), np.inf, needed, found), is_cut
 
-    def _congruent(self, needed: int) -> tuple[Candidates, bool]:
+    def _congruent(self, needed: int, best: Solution) -> tuple[Candidates, bool]:
         """Where in the map a pose that explains so many points can lie, and whether the search was cut.
 
-        In what is large, near targets have to do.
+        In what is large, near ones have to do. They are sought among the points that the best one explains, too: a
+        look-alike explains the same, and points that are no targets may lie between them.
         """
         points, limits = self._evidence.points, (self._options.gate_sigmas, 0.0, self._options.max_rivals)
         groups = max(1, (needed - 1) // 2)
@@ -406,8 +408,11 @@ class _Weighed:
             triples = kernels.covering_triples(points.xyz_mm, needed)
             found = self._index.any(points, self._map, triples, *limits)
             return found, found.is_cut or found.tried < len(triples)
-        near = frame_triangles(points.xyz_mm, points.cov_mm2, 6)
-        return self._index.local(points, self._map, near, *limits), False
+        p, near = best.point, frame_triangles(points.xyz_mm, points.cov_mm2, 6)
+        own = p[frame_triangles(points.xyz_mm[p], points.cov_mm2[p], _QUICK_NEIGHBOURS)]
+        triangles = np.concatenate([own, near])
+        first = np.unique(np.sort(triangles, axis=1), axis=0, return_index=True)[1]
+        return self._index.local(points, self._map, triangles[np.sort(first)], *limits), False
 
     def is_rival(self, best: Solution, other: Solution) -> bool:
         """Whether another solution puts the points elsewhere and yet comes too near the best in explaining them.
@@ -523,8 +528,8 @@ def pose_sigma(cov: Float[np.ndarray, "6 6"], xyz_mm: Float[np.ndarray, "c 3"]) 
 def _windows(evidence: Evidence) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Where a target must be to be seen: for each camera its rotation, its translation, limits of slopes and depth.
 
-    The depths that the frame's points fill, and somewhat more, stand for the sensor's; without a rig, their slopes stand
-    for the field of view.
+    The depths that the frame's points fill, and somewhat more, stand for the sensor's; without a rig, their slopes
+    stand for the field of view.
     """
     xyz = evidence.points.xyz_mm
     if len(xyz) < _WINDOW_POINTS:
