@@ -56,7 +56,7 @@ class Island:
         self.number = number
         self.map = map
         self.frames = 0
-        self.is_absorbed = False
+        self.absorbed_by: Island | None = None
         self.T_world_island = T_world_island
         """Where the island lies if the sensor moved on as it did before it was founded."""
         self.removed = NOTHING
@@ -219,7 +219,7 @@ class Island:
         rows = other.facing(T_other_sensor)
         if len(self.map) == 0 or len(rows) < 3:
             return None
-        _, fix = self.position(Evidence.of(other.seen_from(T_other_sensor, rows)), prediction, clock)
+        _, fix = self.position(Evidence.of(other.seen_from(T_other_sensor, rows), is_whole=False), prediction, clock)
         if isinstance(fix, NoFix) or len(fix.point) < 3:
             return None
         return replace(fix, point=np.searchsorted(np.flatnonzero(other.map.alive), rows[fix.point]))
@@ -229,7 +229,7 @@ class Island:
         points = other.seen_from(T_other_sensor, np.flatnonzero(other.map.alive))
         self.map, added = update(self.map, points, None, bridge, frame.index, None, next_id, self._config.update)
         self.frames += other.frames
-        other.is_absorbed = True
+        other.absorbed_by = self
         self._follow_map(np.unique(np.concatenate([bridge.target, added])))
         return len(added)
 

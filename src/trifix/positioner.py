@@ -84,7 +84,7 @@ class Positioner:
         self._last_ns = -(1 << 63)
         self._islands: list[Island] = []
         self._founded = 0
-        self._joined: set[int] = set()
+        self._joined: dict[int, int] = {}
         self._is_map_given = map is not None
         self._is_map_frozen = is_map_frozen
         self._cameras = ThreadPoolExecutor(2, thread_name_prefix="camera")
@@ -132,9 +132,11 @@ class Positioner:
                 events.append(Event("island_founded", None, f"island {island.number}, {len(points)} targets"))
             if there is not None and island is not None and (island is not self._world or len(added)):
                 events += self._join_islands(frame, island, there, clock)
-                if island.is_absorbed:  # the island has just become part of the world
-                    island = self._world
-                    identification, fix = island.position(evidence, island.predicted(frame.timestamp_ns), clock)
+                if island.absorbed_by is not None:
+                    island = island.absorbed_by
+                    identification, placed = island.position(evidence, island.predicted(frame.timestamp_ns), clock)
+                    there = placed if isinstance(placed, Fix) else None
+                    fix = placed if island is self._world else fix
             if isinstance(fix, NoFix) and fix.weak is not None:
                 self._take_weak(frame, points, matches, fix.weak, clock)
         elif there is not None and island is not None:
@@ -273,26 +275,44 @@ class Positioner:
         return island, first
 
     def _join_islands(self, frame: Frame, island: Island, fix: Fix, clock: Stopwatch) -> list[Event]:
-        """Islands become part of the world as soon as common targets prove where they lie."""
+        """Maps become one as soon as common targets prove how they lie: the world takes in islands, large ones small.
+
+        ``fix`` is that of the frame on ``island``, which may be the world. From where would each other map see what
+        this one shows of the frame?
+        """
         events: list[Event] = []
-        for other in [island] if island is not self._world else list(self._islands):
-            there: Fix | None = fix
-            if island is self._world:  # from where would the island see what the world shows this frame?
-                expected = _across(other.T_world_island, fix.T_world_sensor, is_to_world=False)
-                there = other.bridge(self._world, fix.T_world_sensor, expected, clock)
+        for other in [self._world, *self._islands]:
+            if other is island:
+                continue
+            T = fix.T_world_sensor
+            there = other.bridge(island, T, self._expected(island, other, T), clock)
             if there is None:
                 continue
-            expected = _across(other.T_world_island, there.T_world_sensor, is_to_world=True)
-            bridge = self._world.bridge(other, there.T_world_sensor, expected, clock)
-            if bridge is None:
-                continue
-            new = self._world.absorb(other, there.T_world_sensor, bridge, frame, self._next_id)
+            home, part, T_part_sensor, bridge = other, island, T, there
+            if island is self._world or (other is not self._world and island.frames > other.frames):
+                home, part, T_part_sensor = island, other, there.T_world_sensor
+                back = island.bridge(other, T_part_sensor, self._expected(other, island, T_part_sensor), clock)
+                if back is None:
+                    continue
+                bridge = back
+            new = home.absorb(part, T_part_sensor, bridge, frame, self._next_id)
             self._next_id += new
-            self._islands.remove(other)
-            self._joined.add(other.number)
-            common = len(bridge.point)
-            events.append(Event("island_joined", None, f"island {other.number}, {common} common targets, {new} new"))
+            self._islands.remove(part)
+            self._joined[part.number] = home.number
+            at = "" if home is self._world else f" with island {home.number}"
+            detail = f"island {part.number}{at}, {len(bridge.point)} common targets, {new} new"
+            events.append(Event("island_joined", None, detail))
+            if part is island:
+                break
         return events
+
+    def _expected(self, island: Island, other: Island, T_island_sensor: Pose) -> Prediction | None:
+        """Where the sensor should be on another map, if one of the two is the world and the motion linked them."""
+        if other is self._world and island.T_world_island is not None:
+            return _across(island.T_world_island, T_island_sensor, is_to_world=True)
+        if island is self._world and other.T_world_island is not None:
+            return _across(other.T_world_island, T_island_sensor, is_to_world=False)
+        return None
 
     def _weigh(self, points: SensorPoints, matches: StereoMatches | None, map: ReferenceMap, fix: Fix) -> None:
         """What identified points tell of the recording's noise: by their residuals, and their dots by epipolar ones."""
@@ -380,7 +400,10 @@ class Positioner:
             return step if isinstance(step.fix, Fix) and self._world.number == 0 else None
         if step.elsewhere.island == self._world.number:
             return replace(step, fix=step.elsewhere.fix, map=step.elsewhere.map)
-        return step if self._world.number == 0 and step.elsewhere.island in self._joined else None
+        number = step.elsewhere.island
+        while number in self._joined:
+            number = self._joined[number]
+        return step if number == self._world.number else None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -481,10 +504,8 @@ def _checked(map: ReferenceMap) -> ReferenceMap:
     return map
 
 
-def _across(link: Prediction | None, T: Pose, is_to_world: bool) -> Prediction | None:
+def _across(link: Prediction, T: Pose, is_to_world: bool) -> Prediction:
     """Where a sensor is in the world whose pose on an island is known, or the other way round."""
-    if link is None:
-        return None
     T_world_island = link.T_world_sensor
     there = T_world_island @ T if is_to_world else T_world_island.inverse() @ T
     A = (T if is_to_world else there).inverse().adjoint()

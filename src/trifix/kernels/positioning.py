@@ -22,6 +22,9 @@ _MANY, _LOOKS_PER_CELL = 200, 4
 _FIRST_ASKED = 8
 """Neighbours that a hypothesis is asked for first: if none of them has a target where it should, no more are asked."""
 
+_TRUSTED = 1
+"""State of a target that has been seen again from other poses, or was given."""
+
 SURROUNDING = 5
 """Neighbours of a target that tell how targets lie around it."""
 
@@ -350,9 +353,9 @@ def _residual_jacobian(R, t, point, target, J, residual):
 # --- growing a hypothesis --------------------------------------------------------------------------------------------
 #
 # The arguments come in groups: ``frame`` is (xyz, cov, left, right) of the points and the dots that they are made of,
-# -1 for none; ``scene`` is (xyz, cov, view, state, sightings, misses, neighbour) of the targets; ``grid`` holds the
-# hashed cells of the map's index, (head of each bucket, next in it, position under which a target is filed, width of a
-# cell, how far a target may be from that position).
+# -1 for none; ``scene`` is (xyz, cov, view, state, sightings, misses, neighbour) of the targets, and whether those that
+# are not trusted yet are evidence, too; ``grid`` holds the hashed cells of the map's index: (head of each bucket, next
+# in it, position under which a target is filed, width of a cell, how far a target may be from that position).
 
 
 @njit(cache=True, nogil=True)
@@ -516,9 +519,10 @@ def grow(R, t, P, sequence, frame, used, scene, used_target, grid, gate, matched
                 log_ratio[c] += np.log(shares[c])
             continue
         _innovation_frame(R, B, scene[1][best], S)
-        peak = np.exp(-0.5 * best_d2) * _rarity(R, S, best, scene, cell_mm, Q, D)
-        for c in range(len(shares)):
-            log_ratio[c] += np.log(shares[c] + (1.0 - shares[c]) * peak)
+        if scene[7] or scene[3][best] == _TRUSTED:
+            peak = np.exp(-0.5 * best_d2) * _rarity(R, S, best, scene, cell_mm, Q, D)
+            for c in range(len(shares)):
+                log_ratio[c] += np.log(shares[c] + (1.0 - shares[c]) * peak)
         matched[n] = best
         used_target[best] = True
         if left[n] >= 0:
@@ -646,9 +650,10 @@ def grow_by_dots(R, t, P, dots, used, cams, scene, used_target, alive, cell_mm, 
             U[:] = S
             _add_seen_covariance(A, W, U)
             around = U[0, 0] * U[1, 1] - U[0, 1] * U[1, 0]
-            peak = np.exp(-0.5 * best_d2) * np.sqrt(around / det) / (0.5 * count)
-            for c in range(len(shares)):
-                log_ratio[c] += np.log(shares[c] + (1.0 - shares[c]) * peak)
+            if scene[7] or scene[3][best] == _TRUSTED:
+                peak = np.exp(-0.5 * best_d2) * np.sqrt(around / det) / (0.5 * count)
+                for c in range(len(shares)):
+                    log_ratio[c] += np.log(shares[c] + (1.0 - shares[c]) * peak)
             dot_target[n] = best
             used_target[best] = True
             used[m][row[n]] = True
@@ -801,10 +806,10 @@ def _likelihood(R, frame, scene, matched, d2, cell_mm, log_ratio):
     for n in range(len(matched)):
         peak = 0.0
         if matched[n] >= 0:
+            if not (scene[7] or scene[3][matched[n]] == _TRUSTED):
+                continue
             _innovation_frame(R, frame[1][n], scene[1][matched[n]], S)
             peak = np.exp(-0.5 * d2[n]) * _rarity(R, S, matched[n], scene, cell_mm, Q, D)
-        elif matched[n] == -3:
-            continue
         for c in range(len(shares)):
             log_ratio[c] += np.log(shares[c] + (1.0 - shares[c]) * peak)
 
@@ -848,7 +853,7 @@ def _log_missed(R, t, frame, scene, matched, dot_target, windows, near_mm, is_ma
             for m in range(len(rates)):
                 log_p[m] += np.log(1 - max(rates[m], own))
             continue
-        if state[q] != 1:
+        if state[q] != _TRUSTED:
             continue
         s0, s1, s2 = t[0] - xyz[q, 0], t[1] - xyz[q, 1], t[2] - xyz[q, 2]
         facing = view[q, 0] * s0 + view[q, 1] * s1 + view[q, 2] * s2
@@ -1188,6 +1193,17 @@ def log_mean(log_values):
 
 
 @njit(cache=True, nogil=True)
+def has_trusted(state, most):
+    """Whether so many targets are trusted."""
+    count = 0
+    for each in state:
+        count += each == _TRUSTED
+        if count >= most:
+            return True
+    return False
+
+
+@njit(cache=True, nogil=True)
 def covering_triples(xyz, needed):
     """Triples of points of which every set of ``needed`` points contains one.
 
@@ -1270,7 +1286,7 @@ def warm_up() -> None:
     none = np.full(len(xyz), -1)
     zero = np.zeros(len(xyz), np.int64)
     view = np.tile([0.0, 0.0, -1.0], (len(xyz), 1))
-    scene = (xyz, cov, view, zero, zero, zero, np.full((len(xyz), 8), -1, np.int32))
+    scene = (xyz, cov, view, zero, zero, zero, np.full((len(xyz), 8), -1, np.int32), True)
     grid = (np.array([0], np.int32), np.array([1, 2, 3, 4, -1], np.int32), xyz.astype(np.float32), 100.0, 0.1)
     dots = (zero[:1], zero[:1], np.zeros((1, 2)), np.eye(2)[None])
     cams = (np.tile(np.eye(3), (2, 1, 1)), np.zeros((2, 3)))
@@ -1297,3 +1313,4 @@ def warm_up() -> None:
     )
     log_mean(np.zeros(len(CLUTTER_SHARES)))
     covering_triples(xyz, 3)
+    has_trusted(zero, 1)

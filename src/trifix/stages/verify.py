@@ -94,6 +94,8 @@ class Evidence:
     """The stereo geometry that saw them."""
     noise_scale: float = 1.0
     """Factor on the dots' standard deviations."""
+    is_whole: bool = True
+    """Whether all targets in view should be among the points, as in a frame; a part of another map shows but some."""
 
     @staticmethod
     def of(
@@ -102,11 +104,12 @@ class Evidence:
         dots: StereoDots | None = None,
         rig: StereoRig | None = None,
         noise_scale: float = 1.0,
+        is_whole: bool = True,
     ) -> "Evidence":
         """The evidence of points, and of the pairs of dots that they were triangulated from."""
         if matches is None:
             none = np.full(len(points), -1)
-            return Evidence(points, none, none)
+            return Evidence(points, none, none, is_whole=is_whole)
         left, right = matches.left[points.match].astype(np.int64), matches.right[points.match].astype(np.int64)
         return Evidence(points, left, right, dots, rig, noise_scale)
 
@@ -147,6 +150,7 @@ class Solution:
 _QUICK_NEIGHBOURS = 12  # of each of the three points, for the first look
 _CARRIED_OFF = 1e-3  # ε: probability that the sensor is not where its motion leads
 _WORKED_OUT = 6  # solutions in search of the best one
+_ENOUGH_TRUSTED = 4  # targets, from which on what is not trusted yet proves nothing: false pairs move together
 _DEPTH_MARGIN = 0.15  # a sensor sees somewhat farther, and nearer, than any one frame shows
 _MARGIN_PX = 10.0  # nearer to the image's edge a target may well go unseen
 _WINDOW_POINTS = 4  # of given points, to say what the sensor's field of view is
@@ -243,6 +247,7 @@ class _Weighed:
             map.sightings,
             map.misses,
             index.neighbour,
+            not kernels.has_trusted(map.state, _ENOUGH_TRUSTED),
         )
         self._near = kernels.nearest(points.xyz_mm, max(min(_QUICK_NEIGHBOURS, len(points) - 1), 0))
         self._windows = _windows(evidence)
@@ -354,7 +359,8 @@ class _Weighed:
         triangles = np.unique(np.sort(np.concatenate([each.point for each in every]), axis=1), axis=0)[:_SAMPLE]
         looked_up = sum(max(each.comparisons, len(each)) for each in every)
         search = self._index.any if self._index.targets <= ANYWHERE_UP_TO else self._index.local
-        wide = search(points, self._map, triangles, _WIDER * self._options.gate_sigmas, 0.0, self._options.max_rivals)
+        sigmas = _WIDER * (max(each.max_sigmas for each in every) or self._options.gate_sigmas)
+        wide = search(points, self._map, triangles, sigmas, 0.0, self._options.max_rivals)
         return looked_up * (len(wide) + 1) / (len(triangles) * _WIDER**3)
 
     def _motion_gain(self, T_world_sensor: Pose, spacing_mm: Float[np.ndarray, "c"]) -> float:
@@ -532,7 +538,7 @@ def _windows(evidence: Evidence) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     stand for the field of view.
     """
     xyz = evidence.points.xyz_mm
-    if len(xyz) < _WINDOW_POINTS:
+    if len(xyz) < _WINDOW_POINTS or not evidence.is_whole:
         return np.zeros((0, 3, 3)), np.zeros((0, 3)), np.zeros((0, 6))
     near_mm, far_mm = (1 - _DEPTH_MARGIN) * xyz[:, 2].min(), (1 + _DEPTH_MARGIN) * xyz[:, 2].max()
     if evidence.rig is None:
