@@ -353,9 +353,9 @@ def _residual_jacobian(R, t, point, target, J, residual):
 # --- growing a hypothesis --------------------------------------------------------------------------------------------
 #
 # The arguments come in groups: ``frame`` is (xyz, cov, left, right) of the points and the dots that they are made of,
-# -1 for none; ``scene`` is (xyz, cov, view, state, sightings, misses, neighbour) of the targets, and whether those that
-# are not trusted yet are evidence, too; ``grid`` holds the hashed cells of the map's index: (head of each bucket, next
-# in it, position under which a target is filed, width of a cell, how far a target may be from that position).
+# -1 for none; ``scene`` is (xyz, cov, view, state, sightings, misses, neighbour) of the targets; ``grid`` holds the
+# hashed cells of the map's index: (head of each bucket, next in it, position under which a target is filed, width of a
+# cell, how far a target may be from that position).
 
 
 @njit(cache=True, nogil=True)
@@ -519,10 +519,9 @@ def grow(R, t, P, sequence, frame, used, scene, used_target, grid, gate, matched
                 log_ratio[c] += np.log(shares[c])
             continue
         _innovation_frame(R, B, scene[1][best], S)
-        if scene[7] or scene[3][best] == _TRUSTED:
-            peak = np.exp(-0.5 * best_d2) * _rarity(R, S, best, scene, cell_mm, Q, D)
-            for c in range(len(shares)):
-                log_ratio[c] += np.log(shares[c] + (1.0 - shares[c]) * peak)
+        peak = np.exp(-0.5 * best_d2) * _rarity(R, S, best, scene, cell_mm, Q, D)
+        for c in range(len(shares)):
+            log_ratio[c] += np.log(shares[c] + (1.0 - shares[c]) * peak)
         matched[n] = best
         used_target[best] = True
         if left[n] >= 0:
@@ -650,10 +649,9 @@ def grow_by_dots(R, t, P, dots, used, cams, scene, used_target, alive, cell_mm, 
             U[:] = S
             _add_seen_covariance(A, W, U)
             around = U[0, 0] * U[1, 1] - U[0, 1] * U[1, 0]
-            if scene[7] or scene[3][best] == _TRUSTED:
-                peak = np.exp(-0.5 * best_d2) * np.sqrt(around / det) / (0.5 * count)
-                for c in range(len(shares)):
-                    log_ratio[c] += np.log(shares[c] + (1.0 - shares[c]) * peak)
+            peak = np.exp(-0.5 * best_d2) * np.sqrt(around / det) / (0.5 * count)
+            for c in range(len(shares)):
+                log_ratio[c] += np.log(shares[c] + (1.0 - shares[c]) * peak)
             dot_target[n] = best
             used_target[best] = True
             used[m][row[n]] = True
@@ -806,8 +804,6 @@ def _likelihood(R, frame, scene, matched, d2, cell_mm, log_ratio):
     for n in range(len(matched)):
         peak = 0.0
         if matched[n] >= 0:
-            if not (scene[7] or scene[3][matched[n]] == _TRUSTED):
-                continue
             _innovation_frame(R, frame[1][n], scene[1][matched[n]], S)
             peak = np.exp(-0.5 * d2[n]) * _rarity(R, S, matched[n], scene, cell_mm, Q, D)
         for c in range(len(shares)):
@@ -943,17 +939,18 @@ def _look(h, R, t, P, point, target, near, frame, used, scene, used_target, grid
 
 
 @njit(cache=True, nogil=True)
-def _is_seen_often(R, t, centre, cell_mm, cells, looks):
+def _is_seen_often(R, t, centre, width_mm, cells, looks):
     """Whether enough poses near this one have been looked at; notes it otherwise in an open hash table of cells.
 
-    A cell is as wide as half the targets' spacing, and an eighth in every entry of two columns of R.
+    A cell is as wide as points are vague, and a sixty-fourth in every entry of two columns of R: look-alikes may lie
+    millimetres apart.
     """
     key = np.uint64(14695981039346656037)
     for r in range(3):
         x = R[r, 0] * centre[0] + R[r, 1] * centre[1] + R[r, 2] * centre[2] + t[r]
-        key = (key ^ np.uint64(np.int64(np.floor(2 * x / cell_mm)))) * np.uint64(1099511628211)
-        key = (key ^ np.uint64(np.int64(np.floor(8 * R[r, 0])))) * np.uint64(1099511628211)
-        key = (key ^ np.uint64(np.int64(np.floor(8 * R[r, 1])))) * np.uint64(1099511628211)
+        key = (key ^ np.uint64(np.int64(np.floor(x / width_mm)))) * np.uint64(1099511628211)
+        key = (key ^ np.uint64(np.int64(np.floor(64 * R[r, 0])))) * np.uint64(1099511628211)
+        key = (key ^ np.uint64(np.int64(np.floor(64 * R[r, 1])))) * np.uint64(1099511628211)
     slot = np.int64(key >> np.uint64(20)) % len(cells)
     while looks[slot] > 0 and cells[slot] != key:
         slot = (slot + 1) % len(cells)
@@ -1024,8 +1021,10 @@ def solve(
     order = np.empty(h, np.int64)
     cells, looks = np.zeros(2 * h if h > _MANY else 0, np.uint64), np.zeros(2 * h if h > _MANY else 0, np.int64)
     middle = np.zeros(3)
+    near_mm = 1e-6  # within which a point may be a target, after all
     for p in range(n):
         middle += xyz[p] / n
+        near_mm = max(near_mm, gate * np.sqrt(cov[p, 0, 0] + cov[p, 1, 1] + cov[p, 2, 2]))
     waiting = 0
     looked = 0
     B, D = np.empty((3, 3)), np.empty((3, 3))
@@ -1049,7 +1048,7 @@ def solve(
             if is_known:
                 continue
             if c:
-                if h > _MANY and _is_seen_often(R[a], t[a], middle, cell_mm, cells, looks):
+                if h > _MANY and _is_seen_often(R[a], t[a], middle, near_mm, cells, looks):
                     continue
                 looked += 1
                 asked, found, passed = _look(
@@ -1154,7 +1153,7 @@ def solve(
         if (pairs < 3 and c >= 3) or pairs < needed:
             continue
         asked_targets = dot_target if asks_dots else dot_target[:0]
-        missed = _log_missed(Rs, ts, frame, scene, matched, asked_targets, windows, 0.25 * cell_mm, is_marked)
+        missed = _log_missed(Rs, ts, frame, scene, matched, asked_targets, windows, near_mm, is_marked)
         out_ratio[s] = log_mean(log_ratio) + missed + own[a]
         _likelihood(Rs, frame, scene, matched, out_d2[s], cell_mm, log_ratio)
         out_likelihood[s] = log_mean(log_ratio) + missed
@@ -1190,17 +1189,6 @@ def log_mean(log_values):
     for v in log_values:
         s += np.exp(v - top)
     return top + np.log(s / len(log_values))
-
-
-@njit(cache=True, nogil=True)
-def has_trusted(state, most):
-    """Whether so many targets are trusted."""
-    count = 0
-    for each in state:
-        count += each == _TRUSTED
-        if count >= most:
-            return True
-    return False
 
 
 @njit(cache=True, nogil=True)
@@ -1286,7 +1274,7 @@ def warm_up() -> None:
     none = np.full(len(xyz), -1)
     zero = np.zeros(len(xyz), np.int64)
     view = np.tile([0.0, 0.0, -1.0], (len(xyz), 1))
-    scene = (xyz, cov, view, zero, zero, zero, np.full((len(xyz), 8), -1, np.int32), True)
+    scene = (xyz, cov, view, zero, zero, zero, np.full((len(xyz), 8), -1, np.int32))
     grid = (np.array([0], np.int32), np.array([1, 2, 3, 4, -1], np.int32), xyz.astype(np.float32), 100.0, 0.1)
     dots = (zero[:1], zero[:1], np.zeros((1, 2)), np.eye(2)[None])
     cams = (np.tile(np.eye(3), (2, 1, 1)), np.zeros((2, 3)))
@@ -1313,4 +1301,3 @@ def warm_up() -> None:
     )
     log_mean(np.zeros(len(CLUTTER_SHARES)))
     covering_triples(xyz, 3)
-    has_trusted(zero, 1)

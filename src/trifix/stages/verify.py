@@ -150,7 +150,6 @@ class Solution:
 _QUICK_NEIGHBOURS = 12  # of each of the three points, for the first look
 _CARRIED_OFF = 1e-3  # ε: probability that the sensor is not where its motion leads
 _WORKED_OUT = 6  # solutions in search of the best one
-_ENOUGH_TRUSTED = 4  # targets, from which on what is not trusted yet proves nothing: false pairs move together
 _DEPTH_MARGIN = 0.15  # a sensor sees somewhat farther, and nearer, than any one frame shows
 _MARGIN_PX = 10.0  # nearer to the image's edge a target may well go unseen
 _WINDOW_POINTS = 4  # of given points, to say what the sensor's field of view is
@@ -247,7 +246,6 @@ class _Weighed:
             map.sightings,
             map.misses,
             index.neighbour,
-            not kernels.has_trusted(map.state, _ENOUGH_TRUSTED),
         )
         self._near = kernels.nearest(points.xyz_mm, max(min(_QUICK_NEIGHBOURS, len(points) - 1), 0))
         self._windows = _windows(evidence)
