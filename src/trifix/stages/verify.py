@@ -355,7 +355,7 @@ class _Weighed:
         looked_up = sum(max(each.comparisons, len(each)) for each in every)
         search = self._index.any if self._index.targets <= ANYWHERE_UP_TO else self._index.local
         wide = search(points, self._map, triangles, _WIDER * self._options.gate_sigmas, 0.0, self._options.max_rivals)
-        return looked_up * (len(wide) + 1) / (len(triangles) * _WIDER**3)
+        return looked_up * (len(wide) + 1) / (max(wide.tried, 1) * _WIDER**3)
 
     def _motion_gain(self, T_world_sensor: Pose, spacing_mm: Float[np.ndarray, "c"]) -> float:
         """What the last motion adds to the log ratio of a pose."""
@@ -442,7 +442,7 @@ class _Weighed:
         with the mirrored map agrees by no chance, and yet proves nothing.
         """
         points, c = self._evidence.points, len(best.point)
-        if c < 3 or 2 * c > len(points) + 3:  # the mirror image would have to explain as many points again
+        if c < 3 or c == len(points):  # the mirror image would have to explain more
             return False
         centre = points.xyz_mm[best.point].mean(axis=0)
         normal = np.linalg.svd(points.xyz_mm[best.point] - centre)[2][2]
