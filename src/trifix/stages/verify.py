@@ -134,6 +134,8 @@ class Solution:
     """Spacing of the targets around it (mm)."""
     log_likelihood: float
     """ln of the likelihood of all evidence at this pose against chance: for comparison among solutions."""
+    log_ratio: float
+    """ln of the likelihood ratio of the points against chance, each predicted from those before it; motion aside."""
     p_chance: float
     """Bound of the probability that the agreement is chance."""
 
@@ -154,8 +156,8 @@ _DEPTH_MARGIN = 0.15  # a sensor sees somewhat farther, and nearer, than any one
 _MARGIN_PX = 10.0  # nearer to the image's edge a target may well go unseen
 _WINDOW_POINTS = 4  # of given points, to say what the sensor's field of view is
 _WIDER, _SAMPLE = 6.0, 12  # tolerances so much wider, for so many triangles, tell what chance would bring
-_TRIPLES = 10_000  # of points, to be sought all over the map
-_NO_CHANCE = 0.01  # a rival that explains many points is one only if it is no chance itself
+_TRIPLES = 2_500  # of points, to be sought all over the map
+_OWN_ODDS = 100.0  # a rival that explains many points is one only if they are evidence of it, motion aside
 _NOWHERE = (np.eye(3), np.zeros(3), np.zeros((6, 6)))
 _NO_DOTS = (np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros((0, 2)), np.zeros((0, 2, 2)))
 _NO_CAMERAS = (np.zeros((2, 3, 3)), np.zeros((2, 3)))
@@ -198,8 +200,7 @@ def verify(
             f"by chance so in up to {best.p_chance:.1e} of such frames."
         )
         return NoFix(Reason.not_proven, detail, best.p_chance, len(best.point), best.rms_mm)
-    others, is_cut = weighed.rivals(found, best)
-    found += others
+    found += weighed.rivals(found, best)
     best = max(found, key=lambda each: each.log_likelihood)
     rivals = [each for each in found if each is not best and weighed.is_rival(best, each)]
     if rivals or best.p_chance > options.max_p_chance:
@@ -208,9 +209,6 @@ def verify(
         explained = ", ".join(str(each.matched) for each in told[:4])
         detail = f"{len(told)} poses explain {explained} points."
         return NoFix(Reason.ambiguous, detail, best.p_chance, len(best.point), best.rms_mm, told)
-    if is_cut:
-        detail = f"More than {options.max_rivals} places would have to be searched for other poses that explain it."
-        return NoFix(Reason.out_of_time, detail, best.p_chance, len(best.point), best.rms_mm)
     if weighed.is_mirror_image(best):
         detail = f"{len(best.point)} points agree with the map; in a mirror more would."
         return NoFix(Reason.not_proven, detail, 1.0, len(best.point), best.rms_mm)
@@ -311,6 +309,7 @@ class _Weighed:
                     residual_mm=mm[k, point],
                     spacing_mm=spacing[k, point],
                     log_likelihood=float(log_likelihood[k] + gain),
+                    log_ratio=float(log_ratio[k]),
                     p_chance=p_chance,
                 )
             )
@@ -359,7 +358,7 @@ class _Weighed:
         search = self._index.any if self._index.targets <= ANYWHERE_UP_TO else self._index.local
         sigmas = _WIDER * (max(each.max_sigmas for each in every) or self._options.gate_sigmas)
         wide = search(points, self._map, triangles, sigmas, 0.0, self._options.max_rivals)
-        return looked_up * (len(wide) + 1) / (len(triangles) * _WIDER**3)
+        return looked_up * (len(wide) + 1) / (max(wide.tried, 1) * _WIDER**3)
 
     def _motion_gain(self, T_world_sensor: Pose, spacing_mm: Float[np.ndarray, "c"]) -> float:
         """What the last motion adds to the log ratio of a pose."""
@@ -368,21 +367,24 @@ class _Weighed:
         area_mm2 = self._index.targets * float(np.mean(spacing_mm**2))
         return motion_log_ratio(T_world_sensor, self._prediction, area_mm2)
 
-    def rivals(self, found: list[Solution], best: Solution) -> tuple[list[Solution], bool]:
-        """Solutions that could come too near the best one, beside those found; and whether not all were looked at.
+    def rivals(self, found: list[Solution], best: Solution) -> list[Solution]:
+        """Solutions that could come too near the best one, beside those that have been found.
 
         Whatever pose explains m points of the frame explains three of one group, if the points are parted into groups
         of which there are fewer than m / 2: so a few triples find every pose that can come near enough.
         """
         points, options = self._evidence.points, self._options
-        least = best.log_likelihood - np.log(options.min_rival_odds)
+        most_gain = (
+            0.0 if self._prediction is None else self._motion_gain(self._prediction.T_world_sensor, best.spacing_mm)
+        )
+        least = best.log_likelihood - most_gain - np.log(options.min_rival_odds)
         by_odds = int(np.ceil(least / self._index.largest_evidence(points, self._map)))
         needed = max(3, min(int(np.ceil(options.max_rival_share * len(best.point))), by_odds))
         if len(points) < needed:
-            return [], False
-        candidates, is_cut = self._congruent(needed, best)
+            return []
+        candidates = self._congruent(needed, best)
         if len(candidates) == 0:
-            return [], is_cut
+            return []
         hypotheses = Identification(
             candidates.point, candidates.target, candidates.tried, candidates.expected_by_chance
         )
@@ -396,12 +398,12 @@ class _Weighed:
                 candidates.target,
             )
         )
-        return self.candidates(hypotheses, orientations, (), np.inf, needed, found), is_cut
+        return self.candidates(hypotheses, orientations, (), np.inf, needed, found)
 
-    def _congruent(self, needed: int, best: Solution) -> tuple[Candidates, bool]:
-        """Where in the map a pose that explains so many points can lie, and whether the search was cut.
+    def _congruent(self, needed: int, best: Solution) -> Candidates:
+        """Where in the map a pose that explains so many points can lie.
 
-        In what is large, near ones have to do. They are sought among the points that the best one explains, too: a
+        Where there is too much to search, near triangles have to do. They are sought among the points that the best one explains, too: a
         look-alike explains the same, and points that are no targets may lie between them.
         """
         points, limits = self._evidence.points, (self._options.gate_sigmas, 0.0, self._options.max_rivals)
@@ -411,12 +413,13 @@ class _Weighed:
         if is_small:
             triples = kernels.covering_triples(points.xyz_mm, needed)
             found = self._index.any(points, self._map, triples, *limits)
-            return found, found.is_cut or found.tried < len(triples)
+            if not found.is_cut and found.tried == len(triples):
+                return found
         p, near = best.point, frame_triangles(points.xyz_mm, points.cov_mm2, 6)
         own = p[frame_triangles(points.xyz_mm[p], points.cov_mm2[p], _QUICK_NEIGHBOURS)]
         triangles = np.concatenate([own, near])
         first = np.unique(np.sort(triangles, axis=1), axis=0, return_index=True)[1]
-        return self._index.local(points, self._map, triangles[np.sort(first)], *limits), False
+        return self._index.local(points, self._map, triangles[np.sort(first)], *limits)
 
     def is_rival(self, best: Solution, other: Solution) -> bool:
         """Whether another solution puts the points elsewhere and yet comes too near the best in explaining them.
@@ -435,7 +438,7 @@ class _Weighed:
         if is_elsewhere and is_near:
             return True
         explains_as_many = len(other.point) >= options.max_rival_share * len(best.point)
-        if not explains_as_many or other.p_chance > _NO_CHANCE or len(best.point) == 0:
+        if not explains_as_many or other.log_ratio < np.log(_OWN_ODDS) or len(best.point) == 0:
             return False
         return bool(np.median(np.linalg.norm(apart, axis=1) / best.spacing_mm) > 0.5)
 
@@ -446,7 +449,7 @@ class _Weighed:
         with the mirrored map agrees by no chance, and yet proves nothing.
         """
         points, c = self._evidence.points, len(best.point)
-        if c < 3 or 2 * c > len(points) + 3:  # the mirror image would have to explain as many points again
+        if c < 3 or c == len(points):  # the mirror image would have to explain more
             return False
         centre = points.xyz_mm[best.point].mean(axis=0)
         normal = np.linalg.svd(points.xyz_mm[best.point] - centre)[2][2]
