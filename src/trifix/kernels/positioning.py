@@ -22,6 +22,9 @@ _MANY, _LOOKS_PER_CELL = 200, 4
 _FIRST_ASKED = 8
 """Neighbours that a hypothesis is asked for first: if none of them has a target where it should, no more are asked."""
 
+_HOLDING = 6
+"""Trusted targets that hold a pose without the others."""
+
 _TRUSTED = 1
 """State of a target that has been seen again from other poses, or was given."""
 
@@ -676,8 +679,10 @@ def grow_by_dots(R, t, P, dots, used, cams, scene, used_target, alive, cell_mm, 
 def _refine(R, t, P, frame, scene, matched, dots, cams, dot_target, prior, gate, d2, residual_mm, dot_residual):
     """The pose from all pairs at once, by Gauss-Newton on their Mahalanobis distances; False where they determine none.
 
-    Pairs beyond the gate are let go. ``prior`` is a pose with its information, zero for none. P receives the
-    covariance, ``d2`` (n) and ``residual_mm`` (n) what is left of each pair, ``dot_residual`` (d) the same in slopes.
+    Pairs beyond the gate are let go. Once enough trusted targets hold the pose, those that are not trusted yet have no
+    say in it: some are false pairs, which move together. ``prior`` is a pose with its information, zero for none. P
+    receives the covariance, ``d2`` (n) and ``residual_mm`` (n) what is left of each pair, ``dot_residual`` (d) the same
+    in slopes.
     """
     xyz, cov = frame[0], frame[1]
     camera, xy, dot_cov = dots[0], dots[2], dots[3]
@@ -687,6 +692,9 @@ def _refine(R, t, P, frame, scene, matched, dots, cams, dot_target, prior, gate,
     J, GJ, e = np.zeros((3, 6)), np.empty((3, 6)), np.empty(3)
     p, h, H, U = np.empty(3), np.empty(2), np.empty((2, 3)), np.empty((2, 2))
     HJ, zero = np.empty((2, 6)), np.zeros((3, 3))
+    trusted = 0
+    for n in range(len(xyz)):
+        trusted += matched[n] >= 0 and scene[3][matched[n]] == _TRUSTED
     for _ in range(3):
         for _ in range(6):
             A[:] = prior_info
@@ -713,7 +721,7 @@ def _refine(R, t, P, frame, scene, matched, dots, cams, dot_target, prior, gate,
                 )
             for n in range(len(xyz)):
                 q = matched[n]
-                if q < 0:
+                if q < 0 or (trusted >= _HOLDING and scene[3][q] != _TRUSTED):
                     continue
                 _innovation_frame(R, cov[n], scene[1][q], S)
                 if _inverse3(S, G) <= 0.0:

@@ -403,8 +403,8 @@ class _Weighed:
     def _congruent(self, needed: int, best: Solution) -> Candidates:
         """Where in the map a pose that explains so many points can lie.
 
-        Where there is too much to search, near triangles have to do. They are sought among the points that the best one explains, too: a
-        look-alike explains the same, and points that are no targets may lie between them.
+        Where there is too much to search, near triangles have to do. They are sought among the points that the best one
+        explains, too: a look-alike explains the same, and points that are no targets may lie between them.
         """
         points, limits = self._evidence.points, (self._options.gate_sigmas, 0.0, self._options.max_rivals)
         groups = max(1, (needed - 1) // 2)
