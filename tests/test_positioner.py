@@ -420,3 +420,18 @@ def test_a_wrongly_stated_noise_is_found_out(stated_px, at_least):
     assert at_least <= sum(isinstance(step.fix, Fix) for step in steps) <= 40
     found_px = (stated_px or 0.3) * positioner.noise.scale
     assert 0.09 < found_px < 0.14
+
+
+def test_a_map_with_a_target_twice_is_refused() -> None:
+    world = scattered(np.random.default_rng(3), 8)
+    with pytest.raises(MapError, match="Target 0 of the map given shares its place with another"):
+        Positioner(map=ReferenceMap.given(np.vstack([world, world[:1]])), is_map_frozen=True)
+    with pytest.raises(MapError, match="Target 5 of the map given shares its identity with another"):
+        Positioner(map=ReferenceMap.given(world, id=np.array([5, 1, 2, 3, 4, 5, 6, 7])), is_map_frozen=True)
+
+
+def test_points_as_vague_as_they_lie_apart_define_no_world(world: np.ndarray) -> None:
+    points = seen_points(world, looking(np.random.default_rng(4)), np.random.default_rng(4))
+    vague = replace(points, cov_mm2=points.cov_mm2 * 1e8)
+    step = Positioner(is_noise_stated=True).step(frame_of(0, vague))
+    assert "are known to" in refused(step, Reason.weak_geometry).detail

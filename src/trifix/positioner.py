@@ -445,8 +445,13 @@ def _define_world(points: SensorPoints) -> Fix | NoFix:
     """The first frame is where the world begins, if its points could ever be recognised."""
     if len(points) < 3:
         return NoFix(Reason.too_few_points, f"{len(points)} points.")
-    if spread_off_line_mm(points.xyz_mm) < 3.0:
+    spread_mm = spread_off_line_mm(points.xyz_mm)
+    if spread_mm < 3.0:
         return NoFix(Reason.weak_geometry, "The points lie within 3 mm of one line.")
+    sigma_mm = float(np.sqrt(np.median(np.trace(points.cov_mm2, axis1=1, axis2=2))))
+    if spread_mm < 3.0 * sigma_mm:
+        detail = f"The points lie within {spread_mm:.0f} mm of one line, and are known to {sigma_mm:.0f} mm only."
+        return NoFix(Reason.weak_geometry, detail)
     rows = distinct(points, np.arange(len(points)))
     return Fix(
         T_world_sensor=Pose.identity(),
@@ -491,7 +496,8 @@ def _checked(map: ReferenceMap) -> ReferenceMap:
     """The map, if its targets are somewhere.
 
     Raises:
-        MapError: a target's place or covariance is not finite, or its covariance has a negative variance.
+        MapError: a target's place or covariance is not finite, its covariance has a negative variance, or two targets
+            lie at one place or bear one identity.
     """
     alive = map.rows(np.flatnonzero(map.alive))
     finite = np.isfinite(alive.xyz_mm).all(axis=1) & np.isfinite(alive.cov_mm2).all(axis=(1, 2))
@@ -501,6 +507,11 @@ def _checked(map: ReferenceMap) -> ReferenceMap:
     negative = least < -1e-6 * np.abs(alive.cov_mm2).max(axis=(1, 2), initial=0.0)  # 1e-6: as printed in files
     if negative.any():
         raise MapError(f"The covariance of target {alive.id[np.argmax(negative)]} of the map given is none.")
+    for what, values in (("place", alive.xyz_mm), ("identity", alive.id)):
+        _, first, counts = np.unique(values, axis=0, return_index=True, return_counts=True)
+        if (counts > 1).any():
+            twice = alive.id[first[np.argmax(counts > 1)]]
+            raise MapError(f"Target {twice} of the map given shares its {what} with another: leave one of them out.")
     return map
 
 

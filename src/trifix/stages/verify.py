@@ -152,10 +152,12 @@ class Solution:
 _QUICK_NEIGHBOURS = 12  # of each of the three points, for the first look
 _CARRIED_OFF = 1e-3  # ε: probability that the sensor is not where its motion leads
 _WORKED_OUT = 6  # solutions in search of the best one
+_WIDEST_SLOPE = 2.0  # a target farther to the side than twice its depth is not looked for
 _DEPTH_MARGIN = 0.15  # a sensor sees somewhat farther, and nearer, than any one frame shows
 _MARGIN_PX = 10.0  # nearer to the image's edge a target may well go unseen
 _WINDOW_POINTS = 4  # of given points, to say what the sensor's field of view is
 _WIDER, _SAMPLE = 6.0, 12  # tolerances so much wider, for so many triangles, tell what chance would bring
+_LOOKS = 1500  # places of rivals to look at, those where the three points fit best
 _TRIPLES = 2_500  # of points, to be sought all over the map
 _OWN_ODDS = 100.0  # a rival that explains many points is one only if they are evidence of it, motion aside
 _NOWHERE = (np.eye(3), np.zeros(3), np.zeros((6, 6)))
@@ -258,6 +260,9 @@ class _Weighed:
         """From now on, dots that no point claims count as well."""
         self._dots, self._cameras = _all_dots(self._evidence)
         self._alive = np.flatnonzero(self._map.alive)
+        if self._prediction is not None:  # those ahead, of a map that may be large
+            ahead = self._prediction.T_world_sensor.inverse().apply(self._map.xyz_mm[self._alive])
+            self._alive = self._alive[np.abs(ahead[:, :2]).max(axis=1) < _WIDEST_SLOPE * ahead[:, 2]]
 
     def candidates(
         self,
@@ -385,19 +390,13 @@ class _Weighed:
         candidates = self._congruent(needed, best)
         if len(candidates) == 0:
             return []
-        hypotheses = Identification(
-            candidates.point, candidates.target, candidates.tried, candidates.expected_by_chance
-        )
-        orientations = Orientations(
-            *kernels.orient_triangles(
-                points.xyz_mm,
-                points.cov_mm2,
-                candidates.point,
-                self._map.xyz_mm,
-                self._map.cov_mm2,
-                candidates.target,
-            )
-        )
+        p, q = candidates.point, candidates.target
+        at = kernels.orient_triangles(points.xyz_mm, points.cov_mm2, p, self._map.xyz_mm, self._map.cov_mm2, q)
+        if len(p) > _LOOKS:  # of the many triangles of a pose that explains many points, some agree well
+            best_fitting = np.argsort(at[4], kind="stable")[:_LOOKS]
+            p, q, at = p[best_fitting], q[best_fitting], tuple(each[best_fitting] for each in at)
+        hypotheses = Identification(p, q, candidates.tried, candidates.expected_by_chance)
+        orientations = Orientations(*at)
         return self.candidates(hypotheses, orientations, (), np.inf, needed, found)
 
     def _congruent(self, needed: int, best: Solution) -> Candidates:
