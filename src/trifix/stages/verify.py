@@ -158,6 +158,8 @@ _MARGIN_PX = 10.0  # nearer to the image's edge a target may well go unseen
 _WINDOW_POINTS = 4  # of given points, to say what the sensor's field of view is
 _WIDER, _SAMPLE = 6.0, 12  # tolerances so much wider, for so many triangles, tell what chance would bring
 _LOOKS = 1500  # places of rivals to look at, those where the three points fit best
+_THICK = 10.0  # standard deviations of points, rms about a plane, in which points that agree do not lie in it
+_MOSTLY = 0.8  # of the points explained, their own triangles are those of all points
 _TRIPLES = 2_500  # of points, to be sought all over the map
 _OWN_ODDS = 100.0  # a rival that explains many points is one only if they are evidence of it, motion aside
 _NOWHERE = (np.eye(3), np.zeros(3), np.zeros((6, 6)))
@@ -414,11 +416,14 @@ class _Weighed:
             found = self._index.any(points, self._map, triples, *limits)
             if not found.is_cut and found.tried == len(triples):
                 return found
-        p, near = best.point, frame_triangles(points.xyz_mm, points.cov_mm2, 6)
-        own = p[frame_triangles(points.xyz_mm[p], points.cov_mm2[p], _QUICK_NEIGHBOURS)]
-        triangles = np.concatenate([own, near])
-        first = np.unique(np.sort(triangles, axis=1), axis=0, return_index=True)[1]
-        return self._index.local(points, self._map, triangles[np.sort(first)], *limits)
+        triangles = frame_triangles(points.xyz_mm, points.cov_mm2, 6)
+        p = best.point
+        if len(p) < _MOSTLY * len(points):
+            own = p[frame_triangles(points.xyz_mm[p], points.cov_mm2[p], 8)]
+            triangles = np.concatenate([own, triangles])
+            first = np.unique(np.sort(triangles, axis=1), axis=0, return_index=True)[1]
+            triangles = triangles[np.sort(first)]
+        return self._index.local(points, self._map, triangles, *limits)
 
     def is_rival(self, best: Solution, other: Solution) -> bool:
         """Whether another solution puts the points elsewhere and yet comes too near the best in explaining them.
@@ -451,7 +456,10 @@ class _Weighed:
         if c < 3 or c == len(points):  # the mirror image would have to explain more
             return False
         centre = points.xyz_mm[best.point].mean(axis=0)
-        normal = np.linalg.svd(points.xyz_mm[best.point] - centre)[2][2]
+        _, size, axes = np.linalg.svd(points.xyz_mm[best.point] - centre, full_matrices=False)
+        normal, thickness_mm = axes[2], size[2] / np.sqrt(c)
+        if thickness_mm > _THICK * np.sqrt(np.trace(points.cov_mm2[best.point], axis1=1, axis2=2).max()):
+            return False  # what agrees lies in no plane
         H = np.eye(3) - 2 * np.outer(normal, normal)
         xyz_mm = np.ascontiguousarray((points.xyz_mm - centre) @ H + centre)
         none = np.zeros((1, 0), dtype=np.int64)
