@@ -7,7 +7,9 @@ from nothing: no frame follows another in time. A run that was killed goes on; t
 
 - foreign: another object of the same make. Any fix is wrong.
 - decoy: four to six points are congruent within noise to targets of another place of the map, at most 40 % of the
-  frame; the others are of its own place, or foreign, and then any fix is wrong.
+  frame; the others are of its own place, or foreign. In the second case nothing but the decoy is known: six points made
+  to agree, at the rim of a map, are what a frame shows that has just left it, and no bound on chance can tell them
+  apart. Such fixes are counted by themselves, as misled.
 - mirrored: what a mirror shows of the object, flat ones among them. Any fix is wrong.
 - grid: targets 0.05 to 3 mm off a square grid that reaches beyond the map, so that shifts nearly fit.
 - scaled: the sensor's scale is off by 0.1 to 10 %.
@@ -122,6 +124,7 @@ def judged(task: shards.Task) -> dict[str, object]:
     fixes = {True: 0, False: 0}
     by_residual = {True: 0, False: 0}
     told_wrong = []
+    misled = 0
     for k, frame in enumerate(batch.frames()):
         part = PARTS[task.kind][batch.part[k]]
         parts[f"{part}:frames"] += 1
@@ -129,8 +132,11 @@ def judged(task: shards.Task) -> dict[str, object]:
         match fix:
             case Fix():
                 is_right = is_fix_right(batch, k, fix, world)
-                fixes[is_right] += 1
                 parts[f"{part}:{'right' if is_right else 'wrong'}"] += 1
+                if not is_right and part == UNDECIDABLE:
+                    misled += 1
+                    continue
+                fixes[is_right] += 1
                 (right if is_right else wrong)[decade(fix.p_chance)] += 1
                 matched, rms_mm = len(fix.point), fix.rms_mm
                 if not is_right and len(told_wrong) < _TOLD_WRONG:
@@ -161,6 +167,7 @@ def judged(task: shards.Task) -> dict[str, object]:
         "frames": len(batch),
         "right": fixes[True],
         "wrong": fixes[False],
+        "misled": misled,
         "reasons": dict(reasons),
         "parts": dict(parts),
         "right_by_decade": right.tolist(),
@@ -315,6 +322,9 @@ PARTS = {
 }
 """Varieties of each kind, in the order of ``Batch.part``."""
 
+UNDECIDABLE = "rest foreign"
+"""The variety in which the frame shows nothing of the map but what was made to agree with it."""
+
 
 def surface(rng: np.random.Generator, least: int = 30, relief: float | None = None) -> World:
     """A curved object with a map of it; one in six is flat, unless told."""
@@ -383,9 +393,10 @@ def summarised(results: Mapping[str, dict], config: Config) -> dict[str, object]
     kinds: dict[str, dict] = {}
     for key, result in results.items():
         kind = kinds.setdefault(
-            key.split("/")[0], {"frames": 0, "right": 0, "wrong": 0, "residual_right": 0, "residual_wrong": 0}
+            key.split("/")[0],
+            {"frames": 0, "right": 0, "wrong": 0, "misled": 0, "residual_right": 0, "residual_wrong": 0},
         )
-        for name in ("frames", "right", "wrong", "residual_right", "residual_wrong"):
+        for name in ("frames", "right", "wrong", "misled", "residual_right", "residual_wrong"):
             kind[name] += result[name]
         for name in ("reasons", "parts"):
             kind[name] = dict(Counter(kind.get(name, {})) + Counter(result[name]))
@@ -398,6 +409,7 @@ def summarised(results: Mapping[str, dict], config: Config) -> dict[str, object]
         "frames": frames,
         "right": sum(kind["right"] for kind in kinds.values()),
         "wrong": wrong,
+        "misled": sum(kind["misled"] for kind in kinds.values()),
         "wrong_per_million_at_most": upper_per_million(wrong, frames),
         "residual_alone_wrong_per_million": 1e6 * sum(kind["residual_wrong"] for kind in kinds.values()) / frames,
         "max_p_chance": config.verify.max_p_chance,
@@ -435,7 +447,7 @@ def table(summary: dict) -> Table:
         f"{summary['right']}",
         f"{summary['wrong']}",
         f"{summary['residual_alone_wrong_per_million']:.0f}",
-        f"wrong at most {summary['wrong_per_million_at_most']:.1f} per million (95 %)",
+        f"wrong at most {summary['wrong_per_million_at_most']:.1f} per million (95 %); misled {summary['misled']}",
     )
     return shown
 

@@ -105,6 +105,11 @@ def test_growth_is_the_median_at_each_size_of_the_list() -> None:
     assert slope([7, 7], [10, 12]) is None
 
 
+def test_the_papers_techniques_are_tried_and_ours_is_not() -> None:
+    named = {"frequency", "minimal", "delaunay", "triangles", "hashing", "distances", "icp"}
+    assert set(TECHNIQUES) == named  # each has a line in the figures
+
+
 def test_the_paper_judges_by_one_tolerance_and_residuals_alone() -> None:
     for technique in TECHNIQUES:
         options = paper_options(technique)

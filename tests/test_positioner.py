@@ -23,6 +23,7 @@ from constellations import (
     some_points,
 )
 from trifix.config import Config
+from trifix.errors import MapError
 from trifix.evaluation import compare_poses
 from trifix.files.recordings import read_recording
 from trifix.geometry.pose import Pose
@@ -67,6 +68,57 @@ def test_thousands_of_points_are_refused_at_once(world: np.ndarray) -> None:
     assert "2500 points" in refused(steps[0], Reason.out_of_time).detail
     assert fixed(steps[1].fix).reason is PositionedReason.defines_world
     refused(steps[2], Reason.out_of_time)
+
+
+IMPOSSIBLE = {
+    "not finite": (np.nan, 1.0),
+    "farther off": (1e8, 1.0),
+    "zero": (1.0, 0.0),
+    "flat": (1.0, np.diag([1.0, 1.0, 0.0])),
+    "negative along two axes": (1.0, np.diag([-1.0, -1.0, 1.0])),
+    "one-sided": (1.0, np.triu(np.ones((3, 3))) + 2 * np.eye(3)),
+    "endless": (1.0, 1e300),
+    "next to nothing": (1.0, 1e-300),
+}
+
+
+@pytest.mark.parametrize("case", IMPOSSIBLE)
+def test_impossible_points_are_refused_and_the_run_goes_on(world, case):
+    rng = np.random.default_rng(1)
+    factor, times = IMPOSSIBLE[case]
+    good = seen_points(world, looking(rng), rng)
+    bad = replace(good, xyz_mm=good.xyz_mm.copy(), cov_mm2=good.cov_mm2 * times)
+    bad.xyz_mm[3] *= factor
+    for map in (None, front_map(world)):
+        positioner = Positioner(map=map, is_noise_stated=True)
+        detail = refused(positioner.step(frame_of(0, bad)), Reason.bad_points).detail
+        assert ("row 3" if factor != 1.0 else "20 of 20") in detail
+        fixed(positioner.step(frame_of(1, good)).fix)
+
+
+def test_points_far_beyond_the_map_are_no_candidates(world):
+    rng = np.random.default_rng(1)
+    good = seen_points(world, looking(rng), rng)
+    far = replace(good, xyz_mm=good.xyz_mm * 1000.0)
+    refused(Positioner(map=front_map(world), is_map_frozen=True).step(frame_of(0, far)), Reason.no_candidate)
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf])
+@pytest.mark.parametrize("field", ["xyz_mm", "cov_mm2"])
+def test_a_map_with_a_target_nowhere_is_refused(world, field, value):
+    map = front_map(world)
+    getattr(map, field)[4] = value
+    with pytest.raises(MapError, match=r"Target 4 .* not finite"):
+        Positioner(map=map)
+    map.state[4] = TargetState.removed
+    Positioner(map=map)
+
+
+def test_a_map_with_a_negative_variance_is_refused(world):
+    map = front_map(world, 0.1)
+    map.cov_mm2[7, 0, 0] = -1.0
+    with pytest.raises(MapError, match="covariance of target 7"):
+        Positioner(map=map)
 
 
 @pytest.mark.parametrize("count", [0, 1, 2])
@@ -368,3 +420,18 @@ def test_a_wrongly_stated_noise_is_found_out(stated_px, at_least):
     assert at_least <= sum(isinstance(step.fix, Fix) for step in steps) <= 40
     found_px = (stated_px or 0.3) * positioner.noise.scale
     assert 0.09 < found_px < 0.14
+
+
+def test_a_map_with_a_target_twice_is_refused() -> None:
+    world = scattered(np.random.default_rng(3), 8)
+    with pytest.raises(MapError, match="Target 0 of the map given shares its place with another"):
+        Positioner(map=ReferenceMap.given(np.vstack([world, world[:1]])), is_map_frozen=True)
+    with pytest.raises(MapError, match="Target 5 of the map given shares its identity with another"):
+        Positioner(map=ReferenceMap.given(world, id=np.array([5, 1, 2, 3, 4, 5, 6, 7])), is_map_frozen=True)
+
+
+def test_points_as_vague_as_they_lie_apart_define_no_world(world: np.ndarray) -> None:
+    points = seen_points(world, looking(np.random.default_rng(4)), np.random.default_rng(4))
+    vague = replace(points, cov_mm2=points.cov_mm2 * 1e8)
+    step = Positioner(is_noise_stated=True).step(frame_of(0, vague))
+    assert "are known to" in refused(step, Reason.weak_geometry).detail

@@ -46,7 +46,7 @@ Options = TypeVar("Options", bound=Dataclass)
 class IslandOptions:
     """What becomes of frames that nothing connects to the map."""
 
-    max_islands: int = 6
+    max_islands: int = 12
     """Maps beside the world's to keep at most, those of most frames; 0 for none."""
     min_points: int = 4
     """Points that a frame must have to found one."""

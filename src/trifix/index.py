@@ -18,6 +18,7 @@ ANYWHERE_UP_TO = 300
 _ALIVE = int(TargetState.trusted)  # states up to this one are indexed
 _SAMPLE = 64  # targets from which the spacing is judged
 _SPACING_RATIO = 1.5  # a spacing that is off by more is corrected
+_STEPS_PER_CELL = 96  # of distance, to one cell of space
 _SLACK_CELLS = 1 / 800  # of a cell's width: what a target moves by once it was seen a few times
 _FLOAT32_STEP = 2.0**-22  # anchors must not leave their slack by rounding
 
@@ -107,7 +108,7 @@ class MapIndex:
             map.xyz_mm,
             map.cov_mm2,
             map.view,
-            self._widest_mm2,
+            self._reckoned_mm2(map),
             max_sigmas,
             tolerance_mm,
             limit,
@@ -144,7 +145,9 @@ class MapIndex:
         Prefer ``local`` where targets lie close: this one looks at all pairs of targets that are no farther apart than
         the frame's triangles are long, and keeps them until the next change of the index.
         """
-        table = self._pairs_within(self._longest_mm(points, frame_triangles, max_sigmas, tolerance_mm), max_comparisons)
+        table = self._pairs_within(
+            self._longest_mm(points, map, frame_triangles, max_sigmas, tolerance_mm), max_comparisons
+        )
         if table is None:
             none = np.zeros((0, 3), dtype=np.int64)
             return Candidates(none, none, none[:, 0], 0, 0.0, is_cut=True)
@@ -157,7 +160,7 @@ class MapIndex:
             map.xyz_mm,
             map.cov_mm2,
             map.view,
-            self._widest_mm2,
+            self._reckoned_mm2(map),
             max_sigmas,
             tolerance_mm,
             limit,
@@ -198,31 +201,45 @@ class MapIndex:
         """Grows whenever something is indexed anew."""
         return self._version
 
+    def _reckoned_mm2(self, map: ReferenceMap) -> float:
+        """The largest trace of a target's covariance that look-ups reckon with, so that no vague target widens all.
+
+        A target four times as vague as most is found where it agrees as if it were not.
+        """
+        return min(self._widest_mm2, float(kernels.largest_usual_trace(self._store, map.cov_mm2)))
+
     def _longest_mm(
-        self, points: SensorPoints, triangles: Int[np.ndarray, "t 3"], max_sigmas: float, tolerance_mm: float
+        self,
+        points: SensorPoints,
+        map: ReferenceMap,
+        triangles: Int[np.ndarray, "t 3"],
+        max_sigmas: float,
+        tolerance_mm: float,
     ) -> float:
         """How far apart two targets can be that agree with a side of the frame's triangles."""
         if len(triangles) == 0:
             return 0.0
         corners = points.xyz_mm[triangles]
         longest = np.linalg.norm(corners - corners[:, [1, 2, 0]], axis=2).max()
-        widest_mm2 = np.trace(points.cov_mm2, axis1=1, axis2=2).max() + self._widest_mm2
+        widest_mm2 = np.trace(points.cov_mm2, axis1=1, axis2=2).max() + self._reckoned_mm2(map)
         return float(longest + tolerance_mm + max_sigmas * np.sqrt(2 * widest_mm2) + 2 * self._store.slack_mm)
 
     def _pairs_within(self, reach_mm: float, max_comparisons: int) -> kernels.PairTable | None:
         """All pairs of targets up to this distance, None where there are too many to compare."""
         store = self._store
-        steps = int(reach_mm / store.side_mm) + 1
+        step_mm = store.cell_mm / _STEPS_PER_CELL
+        rows = np.flatnonzero(store.id >= 0)
+        size_mm = np.ptp(store.anchor[rows], axis=0) if len(rows) else np.zeros(3)
+        steps = int(min(reach_mm, float(np.linalg.norm(size_mm))) / step_mm) + 2  # no two are farther apart
         if self._pairs and self._pairs[0] == self._version and len(self._pairs[1].start) > steps:
             return self._pairs[1]
         self._pairs = None
-        rows = np.flatnonzero(store.id >= 0)
-        axis = int(np.argmax(np.ptp(store.anchor[rows], axis=0))) if len(rows) else 0
+        axis = int(np.argmax(size_mm))
         rows = rows[np.argsort(store.anchor[rows, axis], kind="stable")]
-        start, compared = kernels.count_pairs(store.anchor, rows, axis, steps, store.side_mm, max_comparisons)
+        start, compared = kernels.count_pairs(store.anchor, rows, axis, steps, step_mm, max_comparisons)
         if compared > max_comparisons:
             return None
-        self._pairs = self._version, kernels.list_pairs(store.anchor, rows, axis, start, store.side_mm)
+        self._pairs = self._version, kernels.list_pairs(store.anchor, rows, axis, start, step_mm)
         return self._pairs[1]
 
     def _make_room(self, rows: int) -> None:
@@ -233,7 +250,7 @@ class MapIndex:
         grown = kernels.new_store(max(rows, cap + cap // 2), 0, store.cell_mm, store.slack_mm)
         for old, new in zip(store[:5], grown[:5], strict=True):  # what has an entry or several a row
             new[: len(old)] = old
-        self._store = grown._replace(cell_head=store.cell_head, side_head=store.side_head)
+        self._store = grown._replace(cell_head=store.cell_head, side_head=store.side_head, side_mm=store.side_mm)
 
     def _build(self, map: ReferenceMap) -> None:
         """Indexes everything anew, on scales that suit the map."""

@@ -30,7 +30,7 @@ from trifix.records import (
     SensorPoints,
     StereoMatches,
 )
-from trifix.stages.identify import AS_PREDICTED, any_triangles, identifier
+from trifix.stages.identify import AS_PREDICTED, any_triangles, identifier, pairs_as_predicted
 from trifix.stages.orient import orient
 from trifix.stages.predict import Motion, follow, predict
 from trifix.stages.tend import Care, Hand
@@ -56,7 +56,7 @@ class Island:
         self.number = number
         self.map = map
         self.frames = 0
-        self.is_absorbed = False
+        self.absorbed_by: Island | None = None
         self.T_world_island = T_world_island
         """Where the island lies if the sensor moved on as it did before it was founded."""
         self.removed = NOTHING
@@ -104,7 +104,8 @@ class Island:
                 detail = f"{number} hypotheses were tried, and at most {budget} are. {best.detail}".strip()
                 return likeliest, replace(best, why=Reason.out_of_time, detail=detail)
         if evidence.dots is not None and likeliest is not None:
-            for portion in {id(each): each for each in (likeliest, tried[0])}.values():
+            by_motion = [each for each in tried if each.point.shape[1] < 3]
+            for portion in {id(each): each for each in (likeliest, *by_motion)}.values():
                 others = [each for each in tried if each is not portion]
                 fix = self._judge(evidence, portion, others, prediction, clock, asks_dots=True)
                 if isinstance(fix, Fix):
@@ -113,9 +114,11 @@ class Island:
 
     def _hypotheses(self, points: SensorPoints, prediction: Prediction | None) -> Iterator[Identification]:
         """Where the motion leads, first; then from nothing: those of the technique, and then any triangle at all."""
-        options = self._config.identify
+        options, gate = self._config.identify, self._config.verify.gate_sigmas
         if prediction is not None and options.start != "nothing" and self._config.verify.method == "probability":
             yield AS_PREDICTED
+            if 0 < len(points) < 3:
+                yield pairs_as_predicted(points, self.map, prediction.turned or prediction, gate)
         if options.start == "prediction" or len(points) < 3:
             return
         yield from self.identifier.identify(points, self.map, self.motion.newest if self.motion else None)
@@ -134,6 +137,8 @@ class Island:
     ) -> Fix | NoFix:
         """Hypotheses to poses to the one that is proven, by the method that the options name."""
         options, points = self._config.verify, evidence.points
+        if prediction is not None and 0 < identification.point.shape[1] < 3:
+            prediction = prediction.turned or prediction
         with clock("orient"):
             orientations = orient(points, self.map, identification, prediction)
         with clock("verify"):
@@ -214,7 +219,7 @@ class Island:
         rows = other.facing(T_other_sensor)
         if len(self.map) == 0 or len(rows) < 3:
             return None
-        _, fix = self.position(Evidence.of(other.seen_from(T_other_sensor, rows)), prediction, clock)
+        _, fix = self.position(Evidence.of(other.seen_from(T_other_sensor, rows), is_whole=False), prediction, clock)
         if isinstance(fix, NoFix) or len(fix.point) < 3:
             return None
         return replace(fix, point=np.searchsorted(np.flatnonzero(other.map.alive), rows[fix.point]))
@@ -226,7 +231,7 @@ class Island:
             self.map, points, None, bridge, frame.index, None, next_id, self._config.update, self._joint
         )
         self.frames += other.frames
-        other.is_absorbed = True
+        other.absorbed_by = self
         self._follow_map(np.unique(np.concatenate([bridge.target, added])))
         return len(added)
 

@@ -18,7 +18,8 @@ from trifix.kernels import floats, integers
 from trifix.kernels import joint as kernels
 from trifix.records import Fix, ReferenceMap, SensorPoints, TargetState
 
-_ALIVE = int(TargetState.trusted)
+_ALIVE = _TRUSTED = int(TargetState.trusted)  # states up to this one are known here
+_HOLDING = 6  # trusted targets that hold a pose without the others
 _GROUP = 16  # targets that are put away together
 _DEAR = 4.0  # β: what is put away pays so many times as much for lost correlations as what stays
 _RIDGE_MM2 = 1e-9  # so well is nothing known that is put away
@@ -57,10 +58,14 @@ class JointMap:
     def settle(self, map: ReferenceMap, points: SensorPoints, fix: Fix) -> tuple[Pose, Float[np.ndarray, "6 6"]]:
         """The pose of a fix by all that its targets' errors have in common, and its covariance in world coordinates.
 
-        Where dots of a single camera carry it, the pose stays, and what its targets share is added to its covariance.
+        As in verification, targets that are not trusted yet have no say where enough others hold the pose. Where dots of
+        a single camera carry it, the pose stays, and what its targets share is added to its covariance.
         """
         self.follow(map)
         T, point, target = self._known(fix)
+        trusted = np.flatnonzero(map.state[target] == _TRUSTED)
+        if len(trusted) >= _HOLDING:
+            point, target = point[trusted], target[trusted]
         single = fix.single.target[self._id[fix.single.target] >= 0]
         if len(single) or len(point) < _FEWEST:
             return T, fix.cov + self._shared(map, T, np.unique(np.concatenate([target, single])))

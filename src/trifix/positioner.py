@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import assert_never
 
 import numpy as np
-from jaxtyping import Int
+from jaxtyping import Bool, Int
 
 from trifix.config import Config
 from trifix.errors import MapError
@@ -53,6 +53,9 @@ from trifix.stages.weigh import (
 )
 
 _HERE_PERHAPS = 1e-3  # no part of the object is new where what is known agrees so well
+_FARTHEST_MM = 1e6  # no point lies, and no error reaches, a kilometre off
+_LEAST_VARIANCE_MM2 = 1e-12  # a nanometre: nothing is known better
+_LEAST_VARIANCE_SHARE = 1e-12  # of the largest along another axis
 _COULD_BE_ELSEWHERE = (Reason.no_candidate, Reason.not_proven, Reason.out_of_time)
 
 
@@ -76,12 +79,12 @@ class Positioner:
         """Scale of the noise at which the newest frame's pairs were sought."""
         if is_map_frozen and (map is None or not map.alive.any()):
             raise MapError("A frozen map without targets was given: nothing could ever be found on it.")
-        self._world = Island(0, self.config, stored(map or ReferenceMap.empty()), is_map_frozen)
+        self._world = Island(0, self.config, stored(_checked(map or ReferenceMap.empty())), is_map_frozen)
         self._next_id = int(self.map.id.max(initial=-1)) + 1
         self._last_ns = -(1 << 63)
         self._islands: list[Island] = []
         self._founded = 0
-        self._joined: set[int] = set()
+        self._joined: dict[int, int] = {}
         self._is_map_given = map is not None
         self._is_map_frozen = is_map_frozen
         self._cameras = ThreadPoolExecutor(2, thread_name_prefix="camera")
@@ -108,7 +111,7 @@ class Positioner:
         if frame.timestamp_ns < self._last_ns:
             frame = _reversed(frame, self._last_ns)
         elif isinstance(frame.content, SensorPoints):
-            frame = _finite(frame, frame.content)
+            frame = _usable(frame, frame.content)
         self._last_ns = max(self._last_ns, frame.timestamp_ns)
         return self._judge(frame, learns=True)
 
@@ -131,10 +134,12 @@ class Positioner:
                 events.append(Event("island_founded", None, f"island {island.number}, {len(points)} targets"))
             if there is not None and island is not None and (island is not self._world or len(added)):
                 events += self._join_islands(frame, island, there, clock)
-                if island.is_absorbed:  # the island has just become part of the world
-                    island = self._world
-                    identification, fix = island.position(evidence, island.predicted(frame.timestamp_ns), clock)
-                    told = self._told(island, points, fix if isinstance(fix, Fix) else None, clock)
+                if island.absorbed_by is not None:
+                    island = island.absorbed_by
+                    identification, placed = island.position(evidence, island.predicted(frame.timestamp_ns), clock)
+                    there = placed if isinstance(placed, Fix) else None
+                    fix = placed if island is self._world else fix
+                    told = self._told(island, points, there, clock)
             if isinstance(fix, NoFix) and fix.weak is not None:
                 self._take_weak(frame, points, matches, fix.weak, clock)
         elif there is not None and island is not None:
@@ -282,26 +287,44 @@ class Positioner:
         return island, first
 
     def _join_islands(self, frame: Frame, island: Island, fix: Fix, clock: Stopwatch) -> list[Event]:
-        """Islands become part of the world as soon as common targets prove where they lie."""
+        """Maps become one as soon as common targets prove how they lie: the world takes in islands, large ones small.
+
+        ``fix`` is that of the frame on ``island``, which may be the world. From where would each other map see what
+        this one shows of the frame?
+        """
         events: list[Event] = []
-        for other in [island] if island is not self._world else list(self._islands):
-            there: Fix | None = fix
-            if island is self._world:  # from where would the island see what the world shows this frame?
-                expected = _across(other.T_world_island, fix.T_world_sensor, is_to_world=False)
-                there = other.bridge(self._world, fix.T_world_sensor, expected, clock)
+        for other in [self._world, *self._islands]:
+            if other is island:
+                continue
+            T = fix.T_world_sensor
+            there = other.bridge(island, T, self._expected(island, other, T), clock)
             if there is None:
                 continue
-            expected = _across(other.T_world_island, there.T_world_sensor, is_to_world=True)
-            bridge = self._world.bridge(other, there.T_world_sensor, expected, clock)
-            if bridge is None:
-                continue
-            new = self._world.absorb(other, there.T_world_sensor, bridge, frame, self._next_id)
+            home, part, T_part_sensor, bridge = other, island, T, there
+            if island is self._world or (other is not self._world and island.frames > other.frames):
+                home, part, T_part_sensor = island, other, there.T_world_sensor
+                back = island.bridge(other, T_part_sensor, self._expected(other, island, T_part_sensor), clock)
+                if back is None:
+                    continue
+                bridge = back
+            new = home.absorb(part, T_part_sensor, bridge, frame, self._next_id)
             self._next_id += new
-            self._islands.remove(other)
-            self._joined.add(other.number)
-            common = len(bridge.point)
-            events.append(Event("island_joined", None, f"island {other.number}, {common} common targets, {new} new"))
+            self._islands.remove(part)
+            self._joined[part.number] = home.number
+            at = "" if home is self._world else f" with island {home.number}"
+            detail = f"island {part.number}{at}, {len(bridge.point)} common targets, {new} new"
+            events.append(Event("island_joined", None, detail))
+            if part is island:
+                break
         return events
+
+    def _expected(self, island: Island, other: Island, T_island_sensor: Pose) -> Prediction | None:
+        """Where the sensor should be on another map, if one of the two is the world and the motion linked them."""
+        if other is self._world and island.T_world_island is not None:
+            return _across(island.T_world_island, T_island_sensor, is_to_world=True)
+        if island is self._world and other.T_world_island is not None:
+            return _across(other.T_world_island, T_island_sensor, is_to_world=False)
+        return None
 
     def _weigh(self, points: SensorPoints, matches: StereoMatches | None, map: ReferenceMap, fix: Fix) -> None:
         """What identified points tell of the recording's noise: by their residuals, and their dots by epipolar ones."""
@@ -389,7 +412,10 @@ class Positioner:
             return step if isinstance(step.fix, Fix) and self._world.number == 0 else None
         if step.elsewhere.island == self._world.number:
             return replace(step, fix=step.elsewhere.fix, map=step.elsewhere.map)
-        return step if self._world.number == 0 and step.elsewhere.island in self._joined else None
+        number = step.elsewhere.island
+        while number in self._joined:
+            number = self._joined[number]
+        return step if number == self._world.number else None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -431,8 +457,13 @@ def _define_world(points: SensorPoints) -> Fix | NoFix:
     """The first frame is where the world begins, if its points could ever be recognised."""
     if len(points) < 3:
         return NoFix(Reason.too_few_points, f"{len(points)} points.")
-    if spread_off_line_mm(points.xyz_mm) < 3.0:
+    spread_mm = spread_off_line_mm(points.xyz_mm)
+    if spread_mm < 3.0:
         return NoFix(Reason.weak_geometry, "The points lie within 3 mm of one line.")
+    sigma_mm = float(np.sqrt(np.median(np.trace(points.cov_mm2, axis1=1, axis2=2))))
+    if spread_mm < 3.0 * sigma_mm:
+        detail = f"The points lie within {spread_mm:.0f} mm of one line, and are known to {sigma_mm:.0f} mm only."
+        return NoFix(Reason.weak_geometry, detail)
     rows = distinct(points, np.arange(len(points)))
     return Fix(
         T_world_sensor=Pose.identity(),
@@ -451,19 +482,53 @@ def _reversed(frame: Frame, last_ns: int) -> Frame:
     return Frame(frame.index, frame.timestamp_ns, frame.rig, Unusable(Reason.time_reversed, detail))
 
 
-def _finite(frame: Frame, points: SensorPoints) -> Frame:
-    """The same frame, refused where a point is not a number."""
-    bad = ~(np.isfinite(points.xyz_mm).all(axis=1) & np.isfinite(points.cov_mm2).all(axis=(1, 2)))
-    if not bad.any():
-        return frame
-    detail = f"{bad.sum()} of {len(points)} points are not finite, the first in row {points.row[np.argmax(bad)]}."
+def _usable(frame: Frame, points: SensorPoints) -> Frame:
+    """The same frame, refused where a point is not a number, beyond all reach, or has no covariance to weigh it by."""
+    finite = np.isfinite(points.xyz_mm).all(axis=1) & np.isfinite(points.cov_mm2).all(axis=(1, 2))
+    if not finite.all():
+        return _refused(frame, points, ~finite, "are not finite")
+    is_far = np.abs(points.xyz_mm).max(axis=1, initial=0.0) > _FARTHEST_MM
+    if is_far.any():
+        return _refused(frame, points, is_far, f"are farther off than {_FARTHEST_MM:g} mm")
+    transposed = points.cov_mm2.transpose(0, 2, 1)
+    low, _, high = np.linalg.eigvalsh(0.5 * (points.cov_mm2 + transposed)).T
+    is_none = (low < _LEAST_VARIANCE_MM2) | (low < _LEAST_VARIANCE_SHARE * high) | (high > _FARTHEST_MM**2)
+    is_none |= np.abs(points.cov_mm2 - transposed).max(axis=(1, 2), initial=0.0) > _LEAST_VARIANCE_SHARE * high
+    if is_none.any():
+        return _refused(frame, points, is_none, "have a covariance that is singular, negative or out of all bounds")
+    return frame
+
+
+def _refused(frame: Frame, points: SensorPoints, bad: Bool[np.ndarray, "n"], what: str) -> Frame:
+    detail = f"{bad.sum()} of {len(points)} points {what}, the first in row {points.row[np.argmax(bad)]}."
     return replace(frame, content=Unusable(Reason.bad_points, detail))
 
 
-def _across(link: Prediction | None, T: Pose, is_to_world: bool) -> Prediction | None:
+def _checked(map: ReferenceMap) -> ReferenceMap:
+    """The map, if its targets are somewhere.
+
+    Raises:
+        MapError: a target's place or covariance is not finite, its covariance has a negative variance, or two targets
+            lie at one place or bear one identity.
+    """
+    alive = map.rows(np.flatnonzero(map.alive))
+    finite = np.isfinite(alive.xyz_mm).all(axis=1) & np.isfinite(alive.cov_mm2).all(axis=(1, 2))
+    if not finite.all():
+        raise MapError(f"Target {alive.id[np.argmin(finite)]} of the map given holds a value that is not finite.")
+    least = np.linalg.eigvalsh(alive.cov_mm2)[:, 0]
+    negative = least < -1e-6 * np.abs(alive.cov_mm2).max(axis=(1, 2), initial=0.0)  # 1e-6: as printed in files
+    if negative.any():
+        raise MapError(f"The covariance of target {alive.id[np.argmax(negative)]} of the map given is none.")
+    for what, values in (("place", alive.xyz_mm), ("identity", alive.id)):
+        _, first, counts = np.unique(values, axis=0, return_index=True, return_counts=True)
+        if (counts > 1).any():
+            twice = alive.id[first[np.argmax(counts > 1)]]
+            raise MapError(f"Target {twice} of the map given shares its {what} with another: leave one of them out.")
+    return map
+
+
+def _across(link: Prediction, T: Pose, is_to_world: bool) -> Prediction:
     """Where a sensor is in the world whose pose on an island is known, or the other way round."""
-    if link is None:
-        return None
     T_world_island = link.T_world_sensor
     there = T_world_island @ T if is_to_world else T_world_island.inverse() @ T
     A = (T if is_to_world else there).inverse().adjoint()

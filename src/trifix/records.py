@@ -23,7 +23,7 @@ class Reason(Enum):
 
     unreadable_image = "An image of this frame cannot be read."
     no_calibration = "No calibration is known for this frame."
-    bad_points = "The frame holds values that are not finite numbers."
+    bad_points = "The frame holds values that are not finite numbers, or out of all bounds."
     time_reversed = "The frame is older than the one before it."
     too_few_points = "Fewer than three points were seen by both cameras."
     no_candidate = "No constellation of the frame resembles one in the map."
@@ -303,6 +303,8 @@ class Prediction:
     """The pose."""
     cov: Float[np.ndarray, "6 6"]
     """Covariance of δ = (translation mm, rotation rad), T_true = T · exp(δ)."""
+    turned: "Prediction | None" = None
+    """The same if the sensor has turned off its way: as fast as before, in any direction."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

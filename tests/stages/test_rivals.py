@@ -76,3 +76,18 @@ def test_no_rival_is_lost(seed: int) -> None:
         assert found.why in (Reason.ambiguous, Reason.not_proven)
         for rival in expected.rivals:
             assert any(rival.T_world_sensor.distance_mm(other.T_world_sensor) < 2.0 for other in found.rivals)
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_a_look_alike_is_found_though_points_that_are_no_targets_lie_between_all_others(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    patch = scattered(rng, 7, (90.0, 90.0, 30.0), 12.0)
+    turned = patch @ exp_rotation(np.array([0.0, 0.0, rng.uniform(-3, 3)])).T + [600.0, 0.0, 0.0]
+    rest = scattered(rng, 120, (1200.0, 1200.0, 60.0)) + [0.0, 900.0, 0.0]
+    map, T = front_map(np.vstack([patch, turned, rest]), 0.02), looking(rng)
+    clutter = (rng.random((60, 3)) - 0.5) * [180.0, 180.0, 60.0]
+    points = seen_points(np.vstack([patch, clutter]), T, rng)
+    index, one = indexed(map), saying(list(zip(range(3), range(3), strict=True)))
+    found = verify(Evidence.of(points), map, index, one, orient(points, map, one))
+    assert isinstance(found, NoFix)
+    assert found.why is Reason.ambiguous

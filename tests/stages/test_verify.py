@@ -303,6 +303,19 @@ def test_a_mirrored_constellation_is_refused():
         assert answer.why in (Reason.not_proven, Reason.no_candidate)
 
 
+@pytest.mark.parametrize("off", [2, 4])
+def test_a_mirrored_constellation_is_refused_though_most_of_it_lies_in_the_mirror(off):
+    rng = np.random.default_rng(19)
+    for _ in range(10):
+        world = scattered(rng, 8 + off, (150.0, 120.0, 0.0))
+        world[:off, 2] = rng.choice([-20.0, 20.0], off)
+        points = seen_points(world * [1, 1, -1], looking(rng), rng)
+        rows = [off + row for row in firm_triple(world[off:])]
+        answer = judged(points, front_map(world), saying(same(*rows)))
+        assert isinstance(answer, NoFix)
+        assert "mirror" in answer.detail
+
+
 def flat(rng: np.random.Generator, n: int) -> np.ndarray:
     return scattered(rng, n, (150, 120, 0))
 

@@ -217,7 +217,7 @@ class Watch:
 
     def show(self, step: Step) -> None:
         """Looks at the next frame."""
-        if "identify" in step.timings_ms:
+        if "identify" in step.timings_ms and step.points is not None and len(step.points) >= 3:
             self.frame_ms.append(sum(step.timings_ms.values()))
             self.comparisons.append(step.identification.comparisons if step.identification else 0)
         if isinstance(step.fix, Fix):

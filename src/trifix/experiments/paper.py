@@ -35,8 +35,8 @@ from trifix.stages.identify.congruence import Technique
 
 SCENES = ("statue", "plane", "sphere", "head", "head-front")
 """The paper's, in its order."""
-TECHNIQUES: tuple[Technique, ...] = get_args(Technique)
-"""All that the paper names."""
+TECHNIQUES: tuple[Technique, ...] = tuple(each for each in get_args(Technique) if each != "index")
+"""All that the paper names; the index is ours."""
 _NEAREST_MM, _FARTHEST_MM = Sensing().depth_mm
 WORKING_RANGE = {"match.min_depth_mm": str(_NEAREST_MM), "match.max_depth_mm": str(_FARTHEST_MM)}
 """The depths for which the sensor of the scenes is made: pairs that meet elsewhere are no targets."""

@@ -17,7 +17,8 @@ PAIRS = 28
 """Pairs of eight neighbours: the triangles that one target may own."""
 
 _REACH_CELLS = 4  # neighbours are sought within so many cells
-_SIDE_CELLS = 96.0  # cells of sides to one of space: few triangles in each, few cells to a look-up
+_SIDE_CELLS = 3.2  # cells of sides to one of space, times the cube root of the targets: a few triangles in each
+_FEWEST_SIDE_CELLS, _MOST_SIDE_CELLS = 16.0, 128.0
 _SLENDER = 0.15  # triangles whose altitude is a smaller part of their longest side are left out
 _EDGE_ON_SINE = 0.34202014332566873  # sin 20°: nearer to edge-on the handedness of a triangle is not trusted
 _ORDERS = np.array([[0, 1, 2], [1, 2, 0], [2, 0, 1], [0, 2, 1], [2, 1, 0], [1, 0, 2]])  # even ones first
@@ -63,7 +64,7 @@ def new_store(cap: int, targets: int, cell_mm: float, slack_mm: float) -> Store:
             cell_head=np.zeros(0, dtype=np.int32),
             side_head=np.zeros(0, dtype=np.int32),
             cell_mm=cell_mm,
-            side_mm=cell_mm / _SIDE_CELLS,
+            side_mm=cell_mm / _FEWEST_SIDE_CELLS,
             slack_mm=slack_mm,
         ),
         targets,
@@ -73,7 +74,12 @@ def new_store(cap: int, targets: int, cell_mm: float, slack_mm: float) -> Store:
 def with_empty_tables(store: Store, targets: int) -> Store:
     """The same rows with tables of a size for about so many targets, and nothing in them."""
     size = 1 << max(targets, 8).bit_length()
-    return store._replace(cell_head=np.full(size, -1, dtype=np.int32), side_head=np.full(4 * size, -1, dtype=np.int32))
+    cells = min(max(_SIDE_CELLS * targets ** (1 / 3), _FEWEST_SIDE_CELLS), _MOST_SIDE_CELLS)
+    return store._replace(
+        cell_head=np.full(size, -1, dtype=np.int32),
+        side_head=np.full(4 * size, -1, dtype=np.int32),
+        side_mm=store.cell_mm / cells,
+    )
 
 
 # --- small parts -----------------------------------------------------------------------------------------------------
@@ -475,6 +481,18 @@ def _typical_variance(store, cov):
     return 2 / 3 * total / max(count, 1)
 
 
+@njit(cache=True, nogil=True)
+def largest_usual_trace(store, cov):
+    """Sixteen times the median trace of the targets' covariances (mm²), from a sample of them."""
+    trace = np.empty(65)
+    count = 0
+    for r in range(0, len(store.id), len(store.id) // 64 + 1):
+        if store.id[r] >= 0:
+            trace[count] = cov[r, 0, 0] + cov[r, 1, 1] + cov[r, 2, 2]
+            count += 1
+    return 16 * np.median(trace[:count]) if count else 0.0
+
+
 # --- local triangles -------------------------------------------------------------------------------------------------
 
 
@@ -698,6 +716,8 @@ def match_any(
         wide = 4 * reach  # chance is judged from third sides that miss by up to so much
         low, high = max(int((length[2] - reach) / table.step_mm), 0), int((length[2] + reach) / table.step_mm)
         low1, high1 = max(int((length[1] - reach) / table.step_mm), 0), int((length[1] + reach) / table.step_mm)
+        if low >= steps:  # no two targets are so far apart
+            continue
         high, high1 = min(high, steps - 1), min(high1, steps - 1)
         met = 0
         for m in range(table.start[low], table.start[high + 1]):
@@ -864,6 +884,7 @@ def warm_up() -> None:
     turns(frame, len(xyz))
     scene = (frame, xyz, cov, xyz, cov, view, 0.01, 3.0, 0.0, 9)
     match_local(store, *scene)
+    largest_usual_trace(store, cov)
     all_triangles(store)
     largest_evidence(store, xyz, smallest_variance(cov))
     start, _ = count_pairs(store.anchor, rows, 0, 100, 1.0, 9)

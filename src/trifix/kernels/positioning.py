@@ -16,8 +16,17 @@ MISS_RATES = np.array([0.02, 0.1, 0.3, 0.6, 0.9])
 MISS_WEIGHTS = np.array([0.4, 0.3, 0.2, 0.07, 0.03])
 """How common frames of each miss rate are taken to be: mostly nothing is hidden, seldom nearly everything."""
 
+_MANY, _LOOKS_PER_CELL = 200, 4
+"""Of so many hypotheses, only so many that lead to about the same pose get a look."""
+
 _FIRST_ASKED = 8
 """Neighbours that a hypothesis is asked for first: if none of them has a target where it should, no more are asked."""
+
+_HOLDING = 6
+"""Trusted targets that hold a pose without the others."""
+
+_TRUSTED = 1
+"""State of a target that has been seen again from other poses, or was given."""
 
 SURROUNDING = 5
 """Neighbours of a target that tell how targets lie around it."""
@@ -348,7 +357,7 @@ def _residual_jacobian(R, t, point, target, J, residual):
 #
 # The arguments come in groups: ``frame`` is (xyz, cov, left, right) of the points and the dots that they are made of,
 # -1 for none; ``scene`` is (xyz, cov, view, state, sightings, misses, neighbour) of the targets; ``grid`` holds the
-# hashed cells of the map's index, (head of each bucket, next in it, position under which a target is filed, width of a
+# hashed cells of the map's index: (head of each bucket, next in it, position under which a target is filed, width of a
 # cell, how far a target may be from that position).
 
 
@@ -670,8 +679,10 @@ def grow_by_dots(R, t, P, dots, used, cams, scene, used_target, alive, cell_mm, 
 def _refine(R, t, P, frame, scene, matched, dots, cams, dot_target, prior, gate, d2, residual_mm, dot_residual):
     """The pose from all pairs at once, by Gauss-Newton on their Mahalanobis distances; False where they determine none.
 
-    Pairs beyond the gate are let go. ``prior`` is a pose with its information, zero for none. P receives the
-    covariance, ``d2`` (n) and ``residual_mm`` (n) what is left of each pair, ``dot_residual`` (d) the same in slopes.
+    Pairs beyond the gate are let go. Once enough trusted targets hold the pose, those that are not trusted yet have no
+    say in it: some are false pairs, which move together. ``prior`` is a pose with its information, zero for none. P
+    receives the covariance, ``d2`` (n) and ``residual_mm`` (n) what is left of each pair, ``dot_residual`` (d) the same
+    in slopes.
     """
     xyz, cov = frame[0], frame[1]
     camera, xy, dot_cov = dots[0], dots[2], dots[3]
@@ -681,6 +692,9 @@ def _refine(R, t, P, frame, scene, matched, dots, cams, dot_target, prior, gate,
     J, GJ, e = np.zeros((3, 6)), np.empty((3, 6)), np.empty(3)
     p, h, H, U = np.empty(3), np.empty(2), np.empty((2, 3)), np.empty((2, 2))
     HJ, zero = np.empty((2, 6)), np.zeros((3, 3))
+    trusted = 0
+    for n in range(len(xyz)):
+        trusted += matched[n] >= 0 and scene[3][matched[n]] == _TRUSTED
     for _ in range(3):
         for _ in range(6):
             A[:] = prior_info
@@ -707,7 +721,7 @@ def _refine(R, t, P, frame, scene, matched, dots, cams, dot_target, prior, gate,
                 )
             for n in range(len(xyz)):
                 q = matched[n]
-                if q < 0:
+                if q < 0 or (trusted >= _HOLDING and scene[3][q] != _TRUSTED):
                     continue
                 _innovation_frame(R, cov[n], scene[1][q], S)
                 if _inverse3(S, G) <= 0.0:
@@ -800,8 +814,6 @@ def _likelihood(R, frame, scene, matched, d2, cell_mm, log_ratio):
         if matched[n] >= 0:
             _innovation_frame(R, frame[1][n], scene[1][matched[n]], S)
             peak = np.exp(-0.5 * d2[n]) * _rarity(R, S, matched[n], scene, cell_mm, Q, D)
-        elif matched[n] == -3:
-            continue
         for c in range(len(shares)):
             log_ratio[c] += np.log(shares[c] + (1.0 - shares[c]) * peak)
 
@@ -845,7 +857,7 @@ def _log_missed(R, t, frame, scene, matched, dot_target, windows, near_mm, is_ma
             for m in range(len(rates)):
                 log_p[m] += np.log(1 - max(rates[m], own))
             continue
-        if state[q] != 1:
+        if state[q] != _TRUSTED:
             continue
         s0, s1, s2 = t[0] - xyz[q, 0], t[1] - xyz[q, 1], t[2] - xyz[q, 2]
         facing = view[q, 0] * s0 + view[q, 1] * s1 + view[q, 2] * s2
@@ -935,6 +947,27 @@ def _look(h, R, t, P, point, target, near, frame, used, scene, used_target, grid
 
 
 @njit(cache=True, nogil=True)
+def _is_seen_often(R, t, centre, width_mm, cells, looks):
+    """Whether enough poses near this one have been looked at; notes it otherwise in an open hash table of cells.
+
+    A cell is as wide as points are vague, and a sixty-fourth in every entry of two columns of R: look-alikes may lie
+    millimetres apart.
+    """
+    key = np.uint64(14695981039346656037)
+    for r in range(3):
+        x = R[r, 0] * centre[0] + R[r, 1] * centre[1] + R[r, 2] * centre[2] + t[r]
+        key = (key ^ np.uint64(np.int64(np.floor(x / width_mm)))) * np.uint64(1099511628211)
+        key = (key ^ np.uint64(np.int64(np.floor(64 * R[r, 0])))) * np.uint64(1099511628211)
+        key = (key ^ np.uint64(np.int64(np.floor(64 * R[r, 1])))) * np.uint64(1099511628211)
+    slot = np.int64(key >> np.uint64(20)) % len(cells)
+    while looks[slot] > 0 and cells[slot] != key:
+        slot = (slot + 1) % len(cells)
+    cells[slot] = key
+    looks[slot] += 1
+    return looks[slot] > _LOOKS_PER_CELL
+
+
+@njit(cache=True, nogil=True)
 def solve(
     R,
     t,
@@ -994,6 +1027,12 @@ def solve(
     no_dots = (dots[0][:0], dots[1][:0], dots[2][:0], dots[3][:0])
     score = np.full(h, -np.inf)
     order = np.empty(h, np.int64)
+    cells, looks = np.zeros(2 * h if h > _MANY else 0, np.uint64), np.zeros(2 * h if h > _MANY else 0, np.int64)
+    middle = np.zeros(3)
+    near_mm = 1e-6  # within which a point may be a target, after all
+    for p in range(n):
+        middle += xyz[p] / n
+        near_mm = max(near_mm, gate * np.sqrt(cov[p, 0, 0] + cov[p, 1, 1] + cov[p, 2, 2]))
     waiting = 0
     looked = 0
     B, D = np.empty((3, 3)), np.empty((3, 3))
@@ -1017,6 +1056,8 @@ def solve(
             if is_known:
                 continue
             if c:
+                if h > _MANY and _is_seen_often(R[a], t[a], middle, near_mm, cells, looks):
+                    continue
                 looked += 1
                 asked, found, passed = _look(
                     a, R, t, P, point, target, near, frame, used, scene, used_target, grid, gate, look, stamp, log_ratio
@@ -1093,7 +1134,7 @@ def solve(
         pairs = 0
         for p in range(n):
             pairs += matched[p] >= 0
-        if pairs < needed or (pairs < 3 and c):
+        if pairs < needed or (pairs < 3 and c >= 3):
             continue
         asked_dots = dots if asks_dots else no_dots
         info = prior[2] if pairs < 3 else np.zeros((6, 6))
@@ -1117,10 +1158,10 @@ def solve(
         pairs = 0
         for p in range(n):
             pairs += matched[p] >= 0
-        if (pairs < 3 and c) or pairs < needed:
+        if (pairs < 3 and c >= 3) or pairs < needed:
             continue
         asked_targets = dot_target if asks_dots else dot_target[:0]
-        missed = _log_missed(Rs, ts, frame, scene, matched, asked_targets, windows, 0.25 * cell_mm, is_marked)
+        missed = _log_missed(Rs, ts, frame, scene, matched, asked_targets, windows, near_mm, is_marked)
         out_ratio[s] = log_mean(log_ratio) + missed + own[a]
         _likelihood(Rs, frame, scene, matched, out_d2[s], cell_mm, log_ratio)
         out_likelihood[s] = log_mean(log_ratio) + missed

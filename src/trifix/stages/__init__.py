@@ -1,4 +1,4 @@
 """The verbs, none of which knows another, in the order of the work:
 
-detect, match, triangulate, identify, orient, verify, update.
+detect, match, triangulate, weigh, predict, identify, orient, verify, update, tend.
 """

@@ -74,5 +74,8 @@ def predict(motion: Motion | None, timestamp_ns: int, options: PredictOptions) -
         reach_s2 = gap_s * (gap_s + step_s)  # twice the error that a constant acceleration makes
         sigma = 0.5 * reach_s2 * np.repeat([options.acceleration_mm_s2, options.angular_acceleration_rad_s2], 3)
         if (sigma < resting).all():
-            return Prediction(motion.newest @ Pose.exp(velocity * gap_s), np.diag(sigma**2))
+            pace = velocity * gap_s
+            any_way = np.repeat([np.linalg.norm(pace[:3]), np.linalg.norm(pace[3:])], 3)
+            turned = Prediction(motion.newest, np.diag(sigma**2 + any_way**2))
+            return Prediction(motion.newest @ Pose.exp(pace), np.diag(sigma**2), turned)
     return Prediction(motion.newest, np.diag(resting**2))

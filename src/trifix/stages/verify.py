@@ -4,7 +4,8 @@ A pose is accepted when the agreement of the *whole* frame with the map cannot b
 explains the frame about as well: never because three residuals are small. The evidence is a likelihood ratio whose
 mean is at most one for a wrong pose, so that by Markov's inequality its inverse, times the number of false hypotheses
 to be reckoned with, bounds the probability of accepting a wrong one. The three points that made the hypothesis count in
-that number alone: a triangle that chance would seldom match needs less confirmation. The last motion is evidence too.
+that number, as a triangle that chance would seldom match needs less confirmation, and by how well their sides agree.
+The last motion is evidence too, and so are targets that should be seen and are not.
 """
 
 from collections.abc import Sequence
@@ -93,6 +94,8 @@ class Evidence:
     """The stereo geometry that saw them."""
     noise_scale: float = 1.0
     """Factor on the dots' standard deviations."""
+    is_whole: bool = True
+    """Whether all targets in view should be among the points, as in a frame; a part of another map shows but some."""
 
     @staticmethod
     def of(
@@ -101,11 +104,12 @@ class Evidence:
         dots: StereoDots | None = None,
         rig: StereoRig | None = None,
         noise_scale: float = 1.0,
+        is_whole: bool = True,
     ) -> "Evidence":
         """The evidence of points, and of the pairs of dots that they were triangulated from."""
         if matches is None:
             none = np.full(len(points), -1)
-            return Evidence(points, none, none)
+            return Evidence(points, none, none, is_whole=is_whole)
         left, right = matches.left[points.match].astype(np.int64), matches.right[points.match].astype(np.int64)
         return Evidence(points, left, right, dots, rig, noise_scale)
 
@@ -130,6 +134,8 @@ class Solution:
     """Spacing of the targets around it (mm)."""
     log_likelihood: float
     """ln of the likelihood of all evidence at this pose against chance: for comparison among solutions."""
+    log_ratio: float
+    """ln of the likelihood ratio of the points against chance, each predicted from those before it; motion aside."""
     p_chance: float
     """Bound of the probability that the agreement is chance."""
 
@@ -146,11 +152,16 @@ class Solution:
 _QUICK_NEIGHBOURS = 12  # of each of the three points, for the first look
 _CARRIED_OFF = 1e-3  # ε: probability that the sensor is not where its motion leads
 _WORKED_OUT = 6  # solutions in search of the best one
+_WIDEST_SLOPE = 2.0  # a target farther to the side than twice its depth is not looked for
+_DEPTH_MARGIN = 0.15  # a sensor sees somewhat farther, and nearer, than any one frame shows
 _MARGIN_PX = 10.0  # nearer to the image's edge a target may well go unseen
 _WINDOW_POINTS = 4  # of given points, to say what the sensor's field of view is
 _WIDER, _SAMPLE = 6.0, 12  # tolerances so much wider, for so many triangles, tell what chance would bring
-_TRIPLES = 10_000  # of points, to be sought all over the map
-_NO_CHANCE = 0.01  # a rival that explains many points is one only if it is no chance itself
+_LOOKS = 1500  # places of rivals to look at, those where the three points fit best
+_THICK = 10.0  # standard deviations of points, rms about a plane, in which points that agree do not lie in it
+_MOSTLY = 0.8  # of the points explained, their own triangles are those of all points
+_TRIPLES = 2_500  # of points, to be sought all over the map
+_OWN_ODDS = 100.0  # a rival that explains many points is one only if they are evidence of it, motion aside
 _NOWHERE = (np.eye(3), np.zeros(3), np.zeros((6, 6)))
 _NO_DOTS = (np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros((0, 2)), np.zeros((0, 2, 2)))
 _NO_CAMERAS = (np.zeros((2, 3, 3)), np.zeros((2, 3)))
@@ -251,6 +262,9 @@ class _Weighed:
         """From now on, dots that no point claims count as well."""
         self._dots, self._cameras = _all_dots(self._evidence)
         self._alive = np.flatnonzero(self._map.alive)
+        if self._prediction is not None:  # those ahead, of a map that may be large
+            ahead = self._prediction.T_world_sensor.inverse().apply(self._map.xyz_mm[self._alive])
+            self._alive = self._alive[np.abs(ahead[:, :2]).max(axis=1) < _WIDEST_SLOPE * ahead[:, 2]]
 
     def candidates(
         self,
@@ -289,8 +303,8 @@ class _Weighed:
         for k in range(s):
             T, point = Pose(R[k], t[k]), np.flatnonzero(matched[k] >= 0)
             gain = self._motion_gain(T, spacing[k, point])
-            # a hypothesis that names no pairs is the motion itself: it has been counted
-            evidence = log_ratio[k] + (gain if identification.point.shape[1] else 0.0)
+            # a hypothesis of fewer than three pairs rests on the motion itself: it has been counted
+            evidence = log_ratio[k] + (gain if identification.point.shape[1] >= 3 else 0.0)
             p_chance = self._p_chance(evidence, matched[k], identification, earlier)
             solutions.append(
                 Solution(
@@ -302,6 +316,7 @@ class _Weighed:
                     residual_mm=mm[k, point],
                     spacing_mm=spacing[k, point],
                     log_likelihood=float(log_likelihood[k] + gain),
+                    log_ratio=float(log_ratio[k]),
                     p_chance=p_chance,
                 )
             )
@@ -342,11 +357,15 @@ class _Weighed:
         If tolerances were k times as wide, chance would bring k³ times as many, and the true ones would hardly count.
         """
         points = self._evidence.points
+        every = [each for each in every if each.point.shape[1] == 3]
+        if not every:
+            return np.inf
         triangles = np.unique(np.sort(np.concatenate([each.point for each in every]), axis=1), axis=0)[:_SAMPLE]
         looked_up = sum(max(each.comparisons, len(each)) for each in every)
         search = self._index.any if self._index.targets <= ANYWHERE_UP_TO else self._index.local
-        wide = search(points, self._map, triangles, _WIDER * self._options.gate_sigmas, 0.0, self._options.max_rivals)
-        return looked_up * (len(wide) + 1) / (len(triangles) * _WIDER**3)
+        sigmas = _WIDER * (max(each.max_sigmas for each in every) or self._options.gate_sigmas)
+        wide = search(points, self._map, triangles, sigmas, 0.0, self._options.max_rivals)
+        return looked_up * (len(wide) + 1) / (max(wide.tried, 1) * _WIDER**3)
 
     def _motion_gain(self, T_world_sensor: Pose, spacing_mm: Float[np.ndarray, "c"]) -> float:
         """What the last motion adds to the log ratio of a pose."""
@@ -362,38 +381,49 @@ class _Weighed:
         of which there are fewer than m / 2: so a few triples find every pose that can come near enough.
         """
         points, options = self._evidence.points, self._options
-        least = best.log_likelihood - np.log(options.min_rival_odds)
+        most_gain = (
+            0.0 if self._prediction is None else self._motion_gain(self._prediction.T_world_sensor, best.spacing_mm)
+        )
+        least = best.log_likelihood - most_gain - np.log(options.min_rival_odds)
         by_odds = int(np.ceil(least / self._index.largest_evidence(points, self._map)))
         needed = max(3, min(int(np.ceil(options.max_rival_share * len(best.point))), by_odds))
         if len(points) < needed:
             return []
-        candidates = self._congruent(needed)
+        candidates = self._congruent(needed, best)
         if len(candidates) == 0:
             return []
-        hypotheses = Identification(
-            candidates.point, candidates.target, candidates.tried, candidates.expected_by_chance
-        )
-        orientations = Orientations(
-            *kernels.orient_triangles(
-                points.xyz_mm,
-                points.cov_mm2,
-                candidates.point,
-                self._map.xyz_mm,
-                self._map.cov_mm2,
-                candidates.target,
-            )
-        )
+        p, q = candidates.point, candidates.target
+        at = kernels.orient_triangles(points.xyz_mm, points.cov_mm2, p, self._map.xyz_mm, self._map.cov_mm2, q)
+        if len(p) > _LOOKS:  # of the many triangles of a pose that explains many points, some agree well
+            best_fitting = np.argsort(at[4], kind="stable")[:_LOOKS]
+            p, q, at = p[best_fitting], q[best_fitting], tuple(each[best_fitting] for each in at)
+        hypotheses = Identification(p, q, candidates.tried, candidates.expected_by_chance)
+        orientations = Orientations(*at)
         return self.candidates(hypotheses, orientations, (), np.inf, needed, found)
 
-    def _congruent(self, needed: int) -> Candidates:
-        """Where in the map a pose that explains so many points can lie; of what is large, among near targets only."""
+    def _congruent(self, needed: int, best: Solution) -> Candidates:
+        """Where in the map a pose that explains so many points can lie.
+
+        Where there is too much to search, near triangles have to do. They are sought among the points that the best one
+        explains, too: a look-alike explains the same, and points that are no targets may lie between them.
+        """
         points, limits = self._evidence.points, (self._options.gate_sigmas, 0.0, self._options.max_rivals)
         groups = max(1, (needed - 1) // 2)
         size = len(points) / groups
         is_small = groups * size**3 / 6 <= _TRIPLES and self._index.targets <= ANYWHERE_UP_TO
         if is_small:
-            return self._index.any(points, self._map, kernels.covering_triples(points.xyz_mm, needed), *limits)
-        return self._index.local(points, self._map, frame_triangles(points.xyz_mm, points.cov_mm2, 6), *limits)
+            triples = kernels.covering_triples(points.xyz_mm, needed)
+            found = self._index.any(points, self._map, triples, *limits)
+            if not found.is_cut and found.tried == len(triples):
+                return found
+        triangles = frame_triangles(points.xyz_mm, points.cov_mm2, 6)
+        p = best.point
+        if len(p) < _MOSTLY * len(points):
+            own = p[frame_triangles(points.xyz_mm[p], points.cov_mm2[p], 8)]
+            triangles = np.concatenate([own, triangles])
+            first = np.unique(np.sort(triangles, axis=1), axis=0, return_index=True)[1]
+            triangles = triangles[np.sort(first)]
+        return self._index.local(points, self._map, triangles, *limits)
 
     def is_rival(self, best: Solution, other: Solution) -> bool:
         """Whether another solution puts the points elsewhere and yet comes too near the best in explaining them.
@@ -412,7 +442,7 @@ class _Weighed:
         if is_elsewhere and is_near:
             return True
         explains_as_many = len(other.point) >= options.max_rival_share * len(best.point)
-        if not explains_as_many or other.p_chance > _NO_CHANCE or len(best.point) == 0:
+        if not explains_as_many or other.log_ratio < np.log(_OWN_ODDS) or len(best.point) == 0:
             return False
         return bool(np.median(np.linalg.norm(apart, axis=1) / best.spacing_mm) > 0.5)
 
@@ -423,10 +453,13 @@ class _Weighed:
         with the mirrored map agrees by no chance, and yet proves nothing.
         """
         points, c = self._evidence.points, len(best.point)
-        if c < 3 or 2 * c > len(points) + 3:  # the mirror image would have to explain as many points again
+        if c < 3 or c == len(points):  # the mirror image would have to explain more
             return False
         centre = points.xyz_mm[best.point].mean(axis=0)
-        normal = np.linalg.svd(points.xyz_mm[best.point] - centre)[2][2]
+        _, size, axes = np.linalg.svd(points.xyz_mm[best.point] - centre, full_matrices=False)
+        normal, thickness_mm = axes[2], size[2] / np.sqrt(c)
+        if thickness_mm > _THICK * np.sqrt(np.trace(points.cov_mm2[best.point], axis1=1, axis2=2).max()):
+            return False  # what agrees lies in no plane
         H = np.eye(3) - 2 * np.outer(normal, normal)
         xyz_mm = np.ascontiguousarray((points.xyz_mm - centre) @ H + centre)
         none = np.zeros((1, 0), dtype=np.int64)
@@ -509,12 +542,13 @@ def pose_sigma(cov: Float[np.ndarray, "6 6"], xyz_mm: Float[np.ndarray, "c 3"]) 
 def _windows(evidence: Evidence) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Where a target must be to be seen: for each camera its rotation, its translation, limits of slopes and depth.
 
-    Without a rig the slopes and depths that the frame's points fill stand for the field of view.
+    The depths that the frame's points fill, and somewhat more, stand for the sensor's; without a rig, their slopes
+    stand for the field of view.
     """
     xyz = evidence.points.xyz_mm
-    if len(xyz) < _WINDOW_POINTS:
+    if len(xyz) < _WINDOW_POINTS or not evidence.is_whole:
         return np.zeros((0, 3, 3)), np.zeros((0, 3)), np.zeros((0, 6))
-    near_mm, far_mm = xyz[:, 2].min(), xyz[:, 2].max()
+    near_mm, far_mm = (1 - _DEPTH_MARGIN) * xyz[:, 2].min(), (1 + _DEPTH_MARGIN) * xyz[:, 2].max()
     if evidence.rig is None:
         slope = xyz[:, :2] / xyz[:, 2:]
         low, high = slope.min(axis=0), slope.max(axis=0)

@@ -19,7 +19,7 @@ from trifix.stages.identify.distances import Distances
 from trifix.stages.identify.frequency import FrequencyTriangles
 from trifix.stages.identify.hashing import HashedTriangles
 from trifix.stages.identify.icp import ClosestPoints
-from trifix.stages.identify.index import IndexedTriangles, any_triangles
+from trifix.stages.identify.index import IndexedTriangles, any_triangles, pairs_as_predicted
 from trifix.stages.identify.minimal import MinimalTriangles
 from trifix.stages.identify.triangles import AllTriangles
 
@@ -37,6 +37,7 @@ __all__ = [
     "MinimalTriangles",
     "any_triangles",
     "identifier",
+    "pairs_as_predicted",
 ]
 
 

@@ -10,10 +10,11 @@ from collections.abc import Iterator
 import numpy as np
 from jaxtyping import Int
 
+from trifix.geometry.alignment import point_jacobian
 from trifix.geometry.pose import Pose
 from trifix.index import ANYWHERE_UP_TO, MapIndex, frame_triangles
 from trifix.kernels.positioning import covering_triples
-from trifix.records import Identification, ReferenceMap, SensorPoints
+from trifix.records import Identification, Prediction, ReferenceMap, SensorPoints
 from trifix.stages.identify.congruence import IdentifyOptions
 
 _NEIGHBOURS = (6, 12)  # of a point, with pairs of which it forms triangles: the map's eight, fewer first, then more
@@ -80,3 +81,19 @@ def any_triangles(
         triples = triples[found.tried :]
         if found.is_cut:
             return
+
+
+def pairs_as_predicted(
+    points: SensorPoints, map: ReferenceMap, prediction: Prediction, max_sigmas: float
+) -> Identification:
+    """Every point with every target near which the motion leads it, one pair a hypothesis.
+
+    For frames of fewer points than a triangle needs, where the prediction alone leaves open which target is which.
+    """
+    T, alive = prediction.T_world_sensor, np.flatnonzero(map.alive)
+    J = point_jacobian(points.xyz_mm)
+    C = T.R @ (points.cov_mm2 + J @ prediction.cov @ np.swapaxes(J, 1, 2)) @ T.R.T
+    r = map.xyz_mm[alive] - T.apply(points.xyz_mm)[:, None]
+    d2 = np.einsum("nki,nki->nk", r, np.linalg.solve(C[:, None] + map.cov_mm2[alive], r[..., None])[..., 0])
+    point, target = np.nonzero(d2 <= max_sigmas**2)
+    return Identification(point[:, None], alive[target][:, None], len(points) * len(alive), float(len(point)))
