@@ -58,8 +58,8 @@ class JointMap:
     def settle(self, map: ReferenceMap, points: SensorPoints, fix: Fix) -> tuple[Pose, Float[np.ndarray, "6 6"]]:
         """The pose of a fix by all that its targets' errors have in common, and its covariance in world coordinates.
 
-        As in verification, targets that are not trusted yet have no say where enough others hold the pose. Where dots of
-        a single camera carry it, the pose stays, and what its targets share is added to its covariance.
+        As in verification, targets that are not trusted yet have no say where enough others hold the pose. Where dots
+        of a single camera carry it, the pose stays, and what its targets share is added to its covariance.
         """
         self.follow(map)
         T, point, target = self._known(fix)
