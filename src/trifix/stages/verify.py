@@ -279,7 +279,7 @@ class _Weighed:
         """The different solutions of some hypotheses; those beside the ``known`` ones that explain enough points."""
         n = len(self._evidence.points)
         most = self._options.max_solutions if needed else _WORKED_OUT
-        s, R, t, cov, matched, _, mm, dot_target, _, spacing, log_ratio, log_likelihood, _ = kernels.solve(
+        s, R, t, cov, matched, mm, dot_target, spacing, log_ratio, log_likelihood = kernels.solve(
             orientations.R,
             orientations.t_mm,
             orientations.cov,
