@@ -21,7 +21,9 @@ from trifix.geometry.alignment import point_jacobian
 from trifix.geometry.camera import Camera, StereoRig
 from trifix.geometry.pose import Pose
 from trifix.index import ANYWHERE_UP_TO, Candidates, MapIndex, frame_triangles
+from trifix.kernels import floats
 from trifix.kernels import positioning as kernels
+from trifix.kernels.stereo import prepare_dots
 from trifix.records import (
     Fix,
     Identification,
@@ -599,9 +601,8 @@ def _all_dots(evidence: Evidence) -> tuple[tuple[np.ndarray, ...], tuple[np.ndar
     assert dots is not None, "asked before"
     camera, row, xy, cov = [], [], [], []
     for side, (seen, by) in enumerate(((dots.left, rig.left), (dots.right, rig.right))):
-        slopes = by.unproject(seen.uv_px)
-        J = by.unproject_jacobian(slopes)
-        C = evidence.noise_scale**2 * J @ seen.cov_px2 @ J.transpose(0, 2, 1)
+        prepared = prepare_dots(floats(seen.uv_px), floats(seen.cov_px2), by.parameters)
+        slopes, C = prepared[:, :2], evidence.noise_scale**2 * prepared[:, [[2, 3], [3, 4]]]
         good = np.flatnonzero(np.isfinite(slopes).all(axis=1) & np.isfinite(C).all(axis=(1, 2)))
         camera.append(np.full(len(good), side))
         row.append(good)
