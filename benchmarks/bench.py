@@ -56,6 +56,7 @@ def measure(frames: int, queries: int, sizes: tuple[int, ...] = (50, 118, 1000))
     kinds = [misled["kinds"][kind] for kind in KINDS_WITH_FIXES]
     values = {
         "adversarial.wrong": misled["wrong"],
+        "adversarial.misled": misled["misled"] / misled["kinds"]["decoy"]["frames"],
         "adversarial.right": sum(kind["right"] for kind in kinds) / sum(kind["frames"] for kind in kinds),
         "adversarial.wrong_by_residual_alone": misled["residual_alone_wrong_per_million"],
         "chance.wrong_of_promised": chance.wrong_of_promised(weak),

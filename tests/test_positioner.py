@@ -422,6 +422,15 @@ def test_a_wrongly_stated_noise_is_found_out(stated_px, at_least):
     assert 0.09 < found_px < 0.14
 
 
+def test_a_frame_numbered_backwards_is_refused_and_the_run_goes_on(world: np.ndarray) -> None:
+    rng = np.random.default_rng(6)
+    there = looking(rng)
+    frames = [replace(frame_of(k, seen_points(world, there, rng)), index=index) for k, index in enumerate((7, 3, 8))]
+    steps = list(Positioner(is_noise_stated=True).run(frames))
+    assert refused(steps[1], Reason.time_reversed).detail == "It is frame 3, after frame 7."
+    fixed(steps[2].fix)
+
+
 def test_a_map_with_a_target_twice_is_refused() -> None:
     world = scattered(np.random.default_rng(3), 8)
     with pytest.raises(MapError, match="Target 0 of the map given shares its place with another"):

@@ -256,6 +256,8 @@ class MapIndex:
         """Indexes everything anew, on scales that suit the map."""
         alive = np.flatnonzero(map.alive)
         cell_mm = _spacing_mm(map.xyz_mm, alive)
+        if self._scaled_for and self._suits(cell_mm):
+            cell_mm = self._store.cell_mm  # what is found depends on the map, and as little as can be on its past
         rounding_mm = _FLOAT32_STEP * float(np.abs(map.xyz_mm[alive]).max(initial=0.0))
         slack_mm = max(cell_mm * _SLACK_CELLS, rounding_mm)
         self._store = kernels.new_store(len(self._store.id), len(alive), cell_mm, slack_mm)
@@ -264,10 +266,14 @@ class MapIndex:
             self._store, alive, map.id, map.state, map.xyz_mm, _ALIVE, 0, 0
         )
 
+    def _suits(self, spacing_mm: float) -> bool:
+        """Whether the cells are about as wide as the targets are apart."""
+        return 1 / _SPACING_RATIO < spacing_mm / self._store.cell_mm < _SPACING_RATIO
+
     def _rescale(self, map: ReferenceMap) -> None:
         """Resizes the tables to the number of targets, and the cells where these have come to lie otherwise."""
         spacing_mm = _spacing_mm(map.xyz_mm, np.flatnonzero(map.alive))
-        if not 1 / _SPACING_RATIO < spacing_mm / self._store.cell_mm < _SPACING_RATIO:
+        if not self._suits(spacing_mm):
             self._build(map)
             return
         self._scaled_for = self._targets

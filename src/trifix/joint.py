@@ -62,7 +62,7 @@ class JointMap:
         of a single camera carry it, the pose stays, and what its targets share is added to its covariance.
         """
         self.follow(map)
-        T, point, target = self._known(fix)
+        T, point, target = self._known(points, fix)
         trusted = np.flatnonzero(map.state[target] == _TRUSTED)
         if len(trusted) >= _HOLDING:
             point, target = point[trusted], target[trusted]
@@ -77,12 +77,9 @@ class JointMap:
         """Moves the targets by what a fix tells of them, and returns the pose with what its error owes to theirs."""
         self.follow(map)
         self._frames += 1
-        T, point, target = self._known(fix)
+        T, point, target = self._known(points, fix)
         if len(point) < _FEWEST:
             return Knowledge(T, fix.cov, np.zeros((6, len(self._P))))
-        if len(target) > self._capacity:
-            best = np.argsort(np.trace(points.cov_mm2[point], axis1=1, axis2=2), kind="stable")[: self._capacity]
-            point, target = point[best], target[best]
         self._seen[target] = self._frames
         self._make_room(target)
         self._recall(target)
@@ -157,10 +154,17 @@ class JointMap:
         """Rows and columns of P that blocks have taken."""
         return 3 * len(self._row)
 
-    def _known(self, fix: Fix) -> tuple[Pose, Int[np.ndarray, "c"], Int[np.ndarray, "c"]]:
-        """The pose, and the points whose targets are known here."""
-        is_known = self._id[fix.target] >= 0
-        return fix.T_world_sensor, fix.point[is_known], fix.target[is_known]
+    def _known(self, points: SensorPoints, fix: Fix) -> tuple[Pose, Int[np.ndarray, "c"], Int[np.ndarray, "c"]]:
+        """The pose, and the points whose targets are known here; if those are too many, as many as can be held.
+
+        Those that are held come first, as putting targets away and recalling them costs knowledge; then the surest.
+        """
+        known = np.flatnonzero(self._id[fix.target] >= 0)
+        if len(known) > self._capacity:
+            sigma2 = np.trace(points.cov_mm2[fix.point[known]], axis1=1, axis2=2)
+            is_away = self._block[fix.target[known]] < 0
+            known = known[np.lexsort((sigma2, is_away))[: self._capacity]]
+        return fix.T_world_sensor, fix.point[known], fix.target[known]
 
     def _condition(
         self,

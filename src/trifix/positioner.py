@@ -11,9 +11,10 @@ from pathlib import Path
 from typing import assert_never
 
 import numpy as np
-from jaxtyping import Bool, Int
+from jaxtyping import Int
 
 from trifix.config import Config
+from trifix.doors import checked_map, in_order, with_usable_points
 from trifix.errors import MapError
 from trifix.files.recordings import Recording, read_recording
 from trifix.geometry.alignment import spread_off_line_mm
@@ -53,9 +54,6 @@ from trifix.stages.weigh import (
 )
 
 _HERE_PERHAPS = 1e-3  # no part of the object is new where what is known agrees so well
-_FARTHEST_MM = 1e6  # no point lies, and no error reaches, a kilometre off
-_LEAST_VARIANCE_MM2 = 1e-12  # a nanometre: nothing is known better
-_LEAST_VARIANCE_SHARE = 1e-12  # of the largest along another axis
 _COULD_BE_ELSEWHERE = (Reason.no_candidate, Reason.not_proven, Reason.out_of_time)
 
 
@@ -79,9 +77,9 @@ class Positioner:
         """Scale of the noise at which the newest frame's pairs were sought."""
         if is_map_frozen and (map is None or not map.alive.any()):
             raise MapError("A frozen map without targets was given: nothing could ever be found on it.")
-        self._world = Island(0, self.config, stored(_checked(map or ReferenceMap.empty())), is_map_frozen)
+        self._world = Island(0, self.config, stored(checked_map(map or ReferenceMap.empty())), is_map_frozen)
         self._next_id = int(self.map.id.max(initial=-1)) + 1
-        self._last_ns = -(1 << 63)
+        self._last_ns = self._last_index = -(1 << 63)
         self._islands: list[Island] = []
         self._founded = 0
         self._joined: dict[int, int] = {}
@@ -108,11 +106,10 @@ class Positioner:
 
     def step(self, frame: Frame) -> Step:
         """Judges one frame, and lets the map grow by it if it is positioned."""
-        if frame.timestamp_ns < self._last_ns:
-            frame = _reversed(frame, self._last_ns)
-        elif isinstance(frame.content, SensorPoints):
-            frame = _usable(frame, frame.content)
-        self._last_ns = max(self._last_ns, frame.timestamp_ns)
+        frame = in_order(frame, self._last_ns, self._last_index)
+        if isinstance(frame.content, SensorPoints):
+            frame = with_usable_points(frame, frame.content)
+        self._last_ns, self._last_index = max(self._last_ns, frame.timestamp_ns), max(self._last_index, frame.index)
         return self._judge(frame, learns=True)
 
     def _judge(self, frame: Frame, learns: bool) -> Step:
@@ -465,6 +462,10 @@ def _define_world(points: SensorPoints) -> Fix | NoFix:
         detail = f"The points lie within {spread_mm:.0f} mm of one line, and are known to {sigma_mm:.0f} mm only."
         return NoFix(Reason.weak_geometry, detail)
     rows = distinct(points, np.arange(len(points)))
+    if len(rows) < 3:
+        return NoFix(
+            Reason.weak_geometry, f"{len(rows)} of {len(points)} points are known to a tenth of their distance."
+        )
     return Fix(
         T_world_sensor=Pose.identity(),
         cov=np.zeros((6, 6)),
@@ -474,57 +475,6 @@ def _define_world(points: SensorPoints) -> Fix | NoFix:
         p_chance=float("nan"),
         reason=PositionedReason.defines_world,
     )
-
-
-def _reversed(frame: Frame, last_ns: int) -> Frame:
-    """The same frame, refused because it is older than one already judged."""
-    detail = f"It was taken at {frame.timestamp_ns} ns, after one of {last_ns} ns."
-    return Frame(frame.index, frame.timestamp_ns, frame.rig, Unusable(Reason.time_reversed, detail))
-
-
-def _usable(frame: Frame, points: SensorPoints) -> Frame:
-    """The same frame, refused where a point is not a number, beyond all reach, or has no covariance to weigh it by."""
-    finite = np.isfinite(points.xyz_mm).all(axis=1) & np.isfinite(points.cov_mm2).all(axis=(1, 2))
-    if not finite.all():
-        return _refused(frame, points, ~finite, "are not finite")
-    is_far = np.abs(points.xyz_mm).max(axis=1, initial=0.0) > _FARTHEST_MM
-    if is_far.any():
-        return _refused(frame, points, is_far, f"are farther off than {_FARTHEST_MM:g} mm")
-    transposed = points.cov_mm2.transpose(0, 2, 1)
-    low, _, high = np.linalg.eigvalsh(0.5 * (points.cov_mm2 + transposed)).T
-    is_none = (low < _LEAST_VARIANCE_MM2) | (low < _LEAST_VARIANCE_SHARE * high) | (high > _FARTHEST_MM**2)
-    is_none |= np.abs(points.cov_mm2 - transposed).max(axis=(1, 2), initial=0.0) > _LEAST_VARIANCE_SHARE * high
-    if is_none.any():
-        return _refused(frame, points, is_none, "have a covariance that is singular, negative or out of all bounds")
-    return frame
-
-
-def _refused(frame: Frame, points: SensorPoints, bad: Bool[np.ndarray, "n"], what: str) -> Frame:
-    detail = f"{bad.sum()} of {len(points)} points {what}, the first in row {points.row[np.argmax(bad)]}."
-    return replace(frame, content=Unusable(Reason.bad_points, detail))
-
-
-def _checked(map: ReferenceMap) -> ReferenceMap:
-    """The map, if its targets are somewhere.
-
-    Raises:
-        MapError: a target's place or covariance is not finite, its covariance has a negative variance, or two targets
-            lie at one place or bear one identity.
-    """
-    alive = map.rows(np.flatnonzero(map.alive))
-    finite = np.isfinite(alive.xyz_mm).all(axis=1) & np.isfinite(alive.cov_mm2).all(axis=(1, 2))
-    if not finite.all():
-        raise MapError(f"Target {alive.id[np.argmin(finite)]} of the map given holds a value that is not finite.")
-    least = np.linalg.eigvalsh(alive.cov_mm2)[:, 0]
-    negative = least < -1e-6 * np.abs(alive.cov_mm2).max(axis=(1, 2), initial=0.0)  # 1e-6: as printed in files
-    if negative.any():
-        raise MapError(f"The covariance of target {alive.id[np.argmax(negative)]} of the map given is none.")
-    for what, values in (("place", alive.xyz_mm), ("identity", alive.id)):
-        _, first, counts = np.unique(values, axis=0, return_index=True, return_counts=True)
-        if (counts > 1).any():
-            twice = alive.id[first[np.argmax(counts > 1)]]
-            raise MapError(f"Target {twice} of the map given shares its {what} with another: leave one of them out.")
-    return map
 
 
 def _across(link: Prediction, T: Pose, is_to_world: bool) -> Prediction:

@@ -11,7 +11,7 @@ from trifix.geometry.camera import Camera, StereoRig
 from trifix.geometry.epipolar import essential_matrix
 from trifix.kernels.stereo import expected_targets, likeliest_scale, prepare_dots
 from trifix.records import Dots, StereoDots
-from trifix.stages.match import MatchOptions, match, undistort_dots
+from trifix.stages.match import MatchOptions, match
 from trifix.stages.triangulate import triangulate
 
 EQUIDISTANT = Camera(700.0, 702.0, 640.0, 500.0, 1280, 1024, "equidistant", (0.01, -0.02, 0.003, -0.001))
@@ -23,6 +23,12 @@ RIGS = {
     "folding": StereoRig(FOLDING, FOLDING, RIG.T_right_left),
 }
 EACH = pytest.mark.parametrize("rig", list(RIGS.values()), ids=list(RIGS))
+
+
+def undistort_dots(dots: Dots, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
+    """Slopes and their covariances by the compiled camera."""
+    prepared = prepare_dots(dots.uv_px, dots.cov_px2, camera.parameters)
+    return prepared[:, :2], prepared[:, [[2, 3], [3, 4]]]
 
 
 def anywhere(rng: np.random.Generator, n: int) -> Dots:

@@ -122,5 +122,5 @@ def test_moving_the_world_moves_the_fix_and_nothing_else(level, is_map_frozen):
         np.testing.assert_allclose(b.T_world_sensor.t_mm, expected.t_mm, rtol=0, atol=1e-6)
         np.testing.assert_allclose(b.cov, a.cov, rtol=1e-4, atol=1e-15)  # in sensor coordinates, which did not move
         np.testing.assert_allclose(b.residual_mm, a.residual_mm, rtol=0, atol=1e-6)
-        assert np.log(b.p_chance) == pytest.approx(np.log(a.p_chance), abs=0.5)  # chance is estimated from cells
+        assert np.log(b.p_chance) == pytest.approx(np.log(a.p_chance), abs=0.05)
         np.testing.assert_allclose(other.map.xyz_mm, T_new_old.apply(one.map.xyz_mm), rtol=0, atol=1e-6)

@@ -200,15 +200,17 @@ def own_errors(
     """Covariances of some targets apart that, taken for independent, are no less than E = P_group − H cov Hᵀ.
 
     They are λ times its diagonal blocks D, with λ the largest eigenvalue of D⁻¹ E: λ D − E is then nowhere negative.
+    Where E loses its digits to far larger errors, they are c times the blocks of P_group, which no c targets exceed.
     """
     c = len(group)
     m = 3 * c
-    E, D, inverse = np.empty((m, m)), np.empty((c, 3, 3)), np.empty((c, 3, 3))
+    E, D, inverse, whole = np.empty((m, m)), np.empty((c, 3, 3)), np.empty((c, 3, 3)), noise.copy()
     for i in range(m):
         for j in range(m):
             s = P[3 * group[i // 3] + i % 3, 3 * group[j // 3] + j % 3]
             if i // 3 == j // 3:
                 s += noise[i // 3, i % 3, j % 3]
+                whole[i // 3, i % 3, j % 3] = s
             for a in range(6):
                 for b in range(6):
                     s -= H[i, a] * cov[a, b] * H[j, b]
@@ -216,6 +218,8 @@ def own_errors(
             if i // 3 == j // 3:
                 D[i // 3, i % 3, j % 3] = s + noise[i // 3, i % 3, j % 3]
     for i in range(c):
+        if not min(D[i, 0, 0], D[i, 1, 1], D[i, 2, 2]) > 0.0:
+            return float(c) * whole
         _invert(D[i].copy(), inverse[i])
     v, w = np.empty(m), np.empty(m)
     for i in range(m):
@@ -232,6 +236,8 @@ def own_errors(
         for i in range(m):
             k, a = i // 3, i % 3
             bottom += v[i] * (D[k, a, 0] * v[3 * k] + D[k, a, 1] * v[3 * k + 1] + D[k, a, 2] * v[3 * k + 2])
+        if not bottom > 0.0:
+            return float(c) * whole
         largest = max(largest, top / bottom)
         length = 0.0
         for i in range(m):
@@ -239,6 +245,8 @@ def own_errors(
             s = inverse[k, a, 0] * w[3 * k] + inverse[k, a, 1] * w[3 * k + 1] + inverse[k, a, 2] * w[3 * k + 2]
             v[i] = s
             length = max(length, abs(s))
+        if length <= 0.0:  # nothing of E is left in v: the fields explain all of the errors
+            break
         for i in range(m):
             v[i] /= length
     return D * (_MARGIN * largest)

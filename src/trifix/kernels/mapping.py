@@ -11,6 +11,7 @@ from numba import njit
 PROVISIONAL, TRUSTED, REMOVED = 0, 1, 3
 """States of a target, as in ``TargetState``."""
 
+_VAGUE = 0.1  # sigma of a point that is no target any more, in distances from the sensor
 _NEAREST = 4  # known targets, nearest first, that a new point is compared with
 
 
@@ -119,7 +120,7 @@ def new_points(
             is_left_used[left[match[p]]] = is_right_used[right[match[p]]] = True
         for p in range(len(points)):
             is_free[p] &= not (is_left_used[left[match[p]]] or is_right_used[right[match[p]]])
-    rows = distinct_points(points, np.flatnonzero(is_free))
+    rows = distinct_points(points, points_cov, np.flatnonzero(is_free))
     count = 0
     place, C, S = np.empty(3), np.empty((3, 3)), np.empty((3, 3))
     nearest, distance = np.empty(_NEAREST, np.int64), np.empty(_NEAREST)
@@ -196,11 +197,20 @@ def enter_points(
 
 
 @njit(cache=True, nogil=True)
-def distinct_points(points: Float[np.ndarray, "n 3"], rows: Int[np.ndarray, "r"]) -> Int[np.ndarray, "d"]:
-    """Those of some points that are not the same measurement, to a millionth of a millimetre, as an earlier one."""
+def distinct_points(
+    points: Float[np.ndarray, "n 3"], cov: Float[np.ndarray, "n 3 3"], rows: Int[np.ndarray, "r"]
+) -> Int[np.ndarray, "d"]:
+    """Those of some points that could be targets of their own.
+
+    They are not the same measurement, to a millionth of a millimetre, as an earlier one; and their distance from the
+    sensor is known to a tenth, beyond which a covariance says nothing of where they are.
+    """
     out, count = np.empty(len(rows), np.int64), 0
     grid = np.empty((len(rows), 3))
     for p in rows:
+        far2 = points[p, 0] ** 2 + points[p, 1] ** 2 + points[p, 2] ** 2
+        if cov[p, 0, 0] + cov[p, 1, 1] + cov[p, 2, 2] > _VAGUE**2 * far2:
+            continue
         for c in range(3):
             grid[count, c] = np.rint(1e6 * points[p, c])
         is_new = True
@@ -318,5 +328,5 @@ def warm_up() -> None:
     teach(xyz, cov, view, *numbers, np.ones(3, np.bool_), *seen, rows, rows, *pose, 0, False, False, 3, 8)
     new = new_points(xyz, cov, numbers[3], 3, *seen, rows, np.zeros(2, np.int64), none, none, *pose, 6.0)
     enter_points(numbers[0].copy(), xyz, cov, view, *numbers, 3, *seen, new, *pose, 0, 3)
-    distinct_points(points, rows)
+    distinct_points(points, cov, rows)
     squared_distances(xyz, cov, *seen, rows, rows, *pose[:2])

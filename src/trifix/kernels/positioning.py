@@ -676,13 +676,12 @@ def grow_by_dots(R, t, P, dots, used, cams, scene, used_target, alive, cell_mm, 
 
 
 @njit(cache=True, nogil=True)
-def _refine(R, t, P, frame, scene, matched, dots, cams, dot_target, prior, gate, d2, residual_mm, dot_residual):
+def _refine(R, t, P, frame, scene, matched, dots, cams, dot_target, prior, gate, d2, residual_mm):
     """The pose from all pairs at once, by Gauss-Newton on their Mahalanobis distances; False where they determine none.
 
     Pairs beyond the gate are let go. Once enough trusted targets hold the pose, those that are not trusted yet have no
     say in it: some are false pairs, which move together. ``prior`` is a pose with its information, zero for none. P
-    receives the covariance, ``d2`` (n) and ``residual_mm`` (n) what is left of each pair, ``dot_residual`` (d) the same
-    in slopes.
+    receives the covariance, ``d2`` (n) and ``residual_mm`` (n) what is left of each pair of points.
     """
     xyz, cov = frame[0], frame[1]
     camera, xy, dot_cov = dots[0], dots[2], dots[3]
@@ -795,7 +794,6 @@ def _refine(R, t, P, frame, scene, matched, dots, cams, dot_target, prior, gate,
             _add_seen_covariance(H, B, U)
             e0, e1 = h[0] - xy[n, 0], h[1] - xy[n, 1]
             det = U[0, 0] * U[1, 1] - U[0, 1] * U[1, 0]
-            dot_residual[n] = np.sqrt(e0 * e0 + e1 * e1)
             if (U[1, 1] * e0 * e0 - 2 * U[0, 1] * e0 * e1 + U[0, 0] * e1 * e1) / det > gate * gate:
                 dot_target[n], dropped = -1, True
         if not dropped:
@@ -998,9 +996,8 @@ def solve(
     (``enough``, points that a solution must be able to explain, solutions to work out at most); ``known`` (k, n) holds
     matches of solutions whose hypotheses are skipped.
 
-    Returns (number of solutions s, R, t, covariance, target of each point, squared Mahalanobis distance of each pair,
-    its residual in mm, target of each dot, residual of each dot in slopes, spacing of the targets around each, log
-    ratio, log likelihood, hypotheses looked at).
+    Returns (number of solutions s, R, t, covariance, target of each point, residual of each pair in mm, target of each
+    dot, spacing of the targets around each, log ratio, log likelihood).
     """
     xyz, cov, left, right = frame
     enough, needed, most = limits
@@ -1022,7 +1019,7 @@ def solve(
     out_R, out_t, out_P = np.empty((most, 3, 3)), np.empty((most, 3)), np.empty((most, 6, 6))
     out_matched, out_d2 = np.full((most, n), -1, np.int64), np.full((most, n), np.nan)
     out_mm, out_spacing = np.full((most, n), np.nan), np.full((most, n), np.nan)
-    out_dot, out_slope = np.full((most, d), -2, np.int64), np.full((most, d), np.nan)
+    out_dot = np.full((most, d), -2, np.int64)
     out_ratio, out_likelihood = np.empty(most), np.empty(most)
     no_dots = (dots[0][:0], dots[1][:0], dots[2][:0], dots[3][:0])
     score = np.full(h, -np.inf)
@@ -1034,7 +1031,6 @@ def solve(
         middle += xyz[p] / n
         near_mm = max(near_mm, gate * np.sqrt(cov[p, 0, 0] + cov[p, 1, 1] + cov[p, 2, 2]))
     waiting = 0
-    looked = 0
     B, D = np.empty((3, 3)), np.empty((3, 3))
     PJ = np.empty((6, 3))
     for i in range(2 * h):  # first all of them as they come, then those that wait, best first
@@ -1058,7 +1054,6 @@ def solve(
             if c:
                 if h > _MANY and _is_seen_often(R[a], t[a], middle, near_mm, cells, looks):
                     continue
-                looked += 1
                 asked, found, passed = _look(
                     a, R, t, P, point, target, near, frame, used, scene, used_target, grid, gate, look, stamp, log_ratio
                 )
@@ -1152,7 +1147,6 @@ def solve(
             gate,
             out_d2[s],
             out_mm[s],
-            out_slope[s],
         ):
             continue
         pairs = 0
@@ -1178,14 +1172,11 @@ def solve(
         out_t[:s],
         out_P[:s],
         out_matched[:s],
-        out_d2[:s],
         out_mm[:s],
         out_dot[:s],
-        out_slope[:s],
         out_spacing[:s],
         out_ratio[:s],
         out_likelihood[:s],
-        looked,
     )
 
 

@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Float
 
 from trifix.errors import ConfigError
-from trifix.geometry.camera import Camera, StereoRig
+from trifix.geometry.camera import StereoRig
 from trifix.kernels import floats, integers
 from trifix.kernels.stereo import pair_dots, prepare_dots
 from trifix.records import Dots, StereoDots, StereoMatches
@@ -72,12 +72,6 @@ def match(
         float(options.target_diameter_mm),
     )
     return StereoMatches(left, right, epipolar_px, epipolar_sigma_px)
-
-
-def undistort_dots(dots: Dots, camera: Camera) -> tuple[Float[np.ndarray, "n 2"], Float[np.ndarray, "n 2 2"]]:
-    """Undistorted slopes of dots and their covariances."""
-    prepared = _prepared(dots, camera.parameters)
-    return prepared[:, :2], prepared[:, [[2, 3], [3, 4]]]
 
 
 def _prepared(dots: Dots, camera: Float[np.ndarray, "12"]) -> Float[np.ndarray, "n 8"]:

@@ -134,8 +134,8 @@ def update(
 
 
 def distinct(points: SensorPoints, rows: Int[np.ndarray, "r"]) -> Int[np.ndarray, "d"]:
-    """Those of some points that are not the same measurement as an earlier one."""
-    return np.asarray(distinct_points(floats(points.xyz_mm), integers(rows)))
+    """Those of some points that could be targets: not the same measurement as an earlier one, and not too vague."""
+    return np.asarray(distinct_points(floats(points.xyz_mm), floats(points.cov_mm2), integers(rows)))
 
 
 def stored(map: ReferenceMap, extra: int = 0) -> ReferenceMap:

@@ -21,7 +21,9 @@ from trifix.geometry.alignment import point_jacobian
 from trifix.geometry.camera import Camera, StereoRig
 from trifix.geometry.pose import Pose
 from trifix.index import ANYWHERE_UP_TO, Candidates, MapIndex, frame_triangles
+from trifix.kernels import floats
 from trifix.kernels import positioning as kernels
+from trifix.kernels.stereo import prepare_dots
 from trifix.records import (
     Fix,
     Identification,
@@ -159,6 +161,7 @@ _WINDOW_POINTS = 4  # of given points, to say what the sensor's field of view is
 _WIDER, _SAMPLE = 6.0, 12  # tolerances so much wider, for so many triangles, tell what chance would bring
 _LOOKS = 1500  # places of rivals to look at, those where the three points fit best
 _THICK = 10.0  # standard deviations of points, rms about a plane, in which points that agree do not lie in it
+_SCALE_SIGMAS = 3.0  # of the size of what agrees, beyond which another size is tried
 _MOSTLY = 0.8  # of the points explained, their own triangles are those of all points
 _TRIPLES = 2_500  # of points, to be sought all over the map
 _OWN_ODDS = 100.0  # a rival that explains many points is one only if they are evidence of it, motion aside
@@ -213,8 +216,8 @@ def verify(
         explained = ", ".join(str(each.matched) for each in told[:4])
         detail = f"{len(told)} poses explain {explained} points."
         return NoFix(Reason.ambiguous, detail, best.p_chance, len(best.point), best.rms_mm, told)
-    if weighed.is_mirror_image(best):
-        detail = f"{len(best.point)} points agree with the map; in a mirror more would."
+    if distorted := weighed.is_distorted(best):
+        detail = f"{len(best.point)} points agree with the map; {distorted}, more would."
         return NoFix(Reason.not_proven, detail, 1.0, len(best.point), best.rms_mm)
     fix = weighed.fix(best)
     seen_mm = map.xyz_mm[np.concatenate([fix.target, fix.single.target])]
@@ -278,7 +281,7 @@ class _Weighed:
         """The different solutions of some hypotheses; those beside the ``known`` ones that explain enough points."""
         n = len(self._evidence.points)
         most = self._options.max_solutions if needed else _WORKED_OUT
-        s, R, t, cov, matched, _, mm, dot_target, _, spacing, log_ratio, log_likelihood, _ = kernels.solve(
+        s, R, t, cov, matched, mm, dot_target, spacing, log_ratio, log_likelihood = kernels.solve(
             orientations.R,
             orientations.t_mm,
             orientations.cov,
@@ -446,29 +449,43 @@ class _Weighed:
             return False
         return bool(np.median(np.linalg.norm(apart, axis=1) / best.spacing_mm) > 0.5)
 
-    def is_mirror_image(self, best: Solution) -> bool:
-        """Whether the frame is better explained as the mirror image of what the pose shows.
+    def is_distorted(self, best: Solution) -> str:
+        """What would have to be done to the frame to explain more of it, if that is so; empty otherwise.
 
-        Every triangle is its own mirror image in its plane, and so is all that lies in that plane: what else agrees
-        with the mirrored map agrees by no chance, and yet proves nothing.
+        Every triangle is its own mirror image in its plane, and so is all that lies in that plane. In another size, a
+        small part of a constellation still agrees. Neither is chance, and yet both prove nothing.
         """
         points, c = self._evidence.points, len(best.point)
-        if c < 3 or c == len(points):  # the mirror image would have to explain more
-            return False
-        centre = points.xyz_mm[best.point].mean(axis=0)
-        _, size, axes = np.linalg.svd(points.xyz_mm[best.point] - centre, full_matrices=False)
-        normal, thickness_mm = axes[2], size[2] / np.sqrt(c)
-        if thickness_mm > _THICK * np.sqrt(np.trace(points.cov_mm2[best.point], axis1=1, axis2=2).max()):
-            return False  # what agrees lies in no plane
-        H = np.eye(3) - 2 * np.outer(normal, normal)
-        xyz_mm = np.ascontiguousarray((points.xyz_mm - centre) @ H + centre)
-        none = np.zeros((1, 0), dtype=np.int64)
-        T = best.T_world_sensor
+        if c < 3 or c == len(points):
+            return ""
+        xyz_mm, target_mm = points.xyz_mm[best.point], self._map.xyz_mm[best.matched[best.point]]
+        centre = xyz_mm.mean(axis=0)
+        offset = xyz_mm - centre
+        size2_mm2 = float((offset**2).sum())
+        scale = float((offset @ best.T_world_sensor.R.T * (target_mm - target_mm.mean(axis=0))).sum()) / size2_mm2
+        variance_mm2 = np.trace(points.cov_mm2[best.point], axis1=1, axis2=2).max()
+        sigma_mm = np.sqrt(variance_mm2 + np.trace(self._map.cov_mm2[best.matched[best.point]], axis1=1, axis2=2).max())
+        if abs(scale - 1) > _SCALE_SIGMAS * sigma_mm / np.sqrt(size2_mm2) and self._is_better(
+            best, centre, scale * np.eye(3)
+        ):
+            return f"{scale:.4f} times as large"
+        _, size, axes = np.linalg.svd(offset, full_matrices=False)
+        if size[2] / np.sqrt(c) > _THICK * np.sqrt(variance_mm2):
+            return ""  # what agrees lies in no plane
+        if self._is_better(best, centre, np.eye(3) - 2 * np.outer(axes[2], axes[2])):
+            return "in a mirror"
+        return ""
+
+    def _is_better(self, best: Solution, centre: Float[np.ndarray, "3"], A: Float[np.ndarray, "3 3"]) -> bool:
+        """Whether the pose explains more if the points are distorted about a centre."""
+        points = self._evidence.points
+        xyz_mm = np.ascontiguousarray((points.xyz_mm - centre) @ A.T + centre)
+        none, T = np.zeros((1, 0), dtype=np.int64), best.T_world_sensor
         as_it_is = Orientations(T.R[None], T.t_mm[None], best.cov[None], _VALID, np.zeros(1))
-        mirrored = replace(self._evidence, points=replace(points, xyz_mm=xyz_mm, cov_mm2=H @ points.cov_mm2 @ H))
-        weighed = _Weighed(mirrored, self._map, self._index, None, self._options)
+        distorted = replace(self._evidence, points=replace(points, xyz_mm=xyz_mm, cov_mm2=A @ points.cov_mm2 @ A.T))
+        weighed = _Weighed(distorted, self._map, self._index, None, self._options)
         found = weighed.candidates(Identification(none, none), as_it_is, (), 0.0)
-        return any(len(each.point) > c and each.log_likelihood > best.log_likelihood for each in found)
+        return any(len(each.point) > len(best.point) and each.log_likelihood > best.log_likelihood for each in found)
 
     def fix(self, best: Solution) -> Fix:
         """A solution as the answer."""
@@ -584,9 +601,8 @@ def _all_dots(evidence: Evidence) -> tuple[tuple[np.ndarray, ...], tuple[np.ndar
     assert dots is not None, "asked before"
     camera, row, xy, cov = [], [], [], []
     for side, (seen, by) in enumerate(((dots.left, rig.left), (dots.right, rig.right))):
-        slopes = by.unproject(seen.uv_px)
-        J = by.unproject_jacobian(slopes)
-        C = evidence.noise_scale**2 * J @ seen.cov_px2 @ J.transpose(0, 2, 1)
+        prepared = prepare_dots(floats(seen.uv_px), floats(seen.cov_px2), by.parameters)
+        slopes, C = prepared[:, :2], evidence.noise_scale**2 * prepared[:, [[2, 3], [3, 4]]]
         good = np.flatnonzero(np.isfinite(slopes).all(axis=1) & np.isfinite(C).all(axis=(1, 2)))
         camera.append(np.full(len(good), side))
         row.append(good)

@@ -73,10 +73,10 @@ class Identifier(Protocol):
 
 
 def identifier(options: IdentifyOptions, index: MapIndex | None = None) -> Identifier:
-    """The technique that the options name, with an empty memory; ``index`` is that of the map, if there is one."""
+    """The technique that the options name, with an empty memory; ``index`` is that of the map, kept by its owner."""
     match options.technique:
         case "index":
-            return IndexedTriangles(options, index or MapIndex())
+            return IndexedTriangles(options, index)
         case "icp":
             return ClosestPoints(options)
         case "distances":

@@ -26,9 +26,10 @@ _FIRST_PORTION = 16  # pairs of triangles; eight times as many in each that foll
 class IndexedTriangles:
     """Looks up the frame's local triangles in the index of the map."""
 
-    def __init__(self, options: IdentifyOptions, index: MapIndex) -> None:
+    def __init__(self, options: IdentifyOptions, index: MapIndex | None) -> None:
         self._options = options
-        self._index = index
+        self._index = index or MapIndex()
+        self._follows = index is None
 
     def identify(
         self, points: SensorPoints, map: ReferenceMap, prediction: Pose | None = None
@@ -48,8 +49,9 @@ class IndexedTriangles:
                 )
 
     def learn(self, map: ReferenceMap, seen: Int[np.ndarray, "s"]) -> None:
-        """Brings the index up to date, if its owner has not yet done so."""
-        self._index.follow(map)
+        """Brings the index up to date, where it is nobody else's."""
+        if self._follows:
+            self._index.follow(map)
 
     def triangles(self) -> Int[np.ndarray, "t 3"]:
         """The triangles in the index."""
