@@ -27,6 +27,7 @@ from trifix.stages.identify.congruence import Technique
 from trifix.stages.match import MatchOptions
 from trifix.stages.predict import PredictOptions
 from trifix.stages.tend import TendOptions
+from trifix.stages.triangulate import TriangulateOptions
 from trifix.stages.update import UpdateOptions
 from trifix.stages.verify import VerifyOptions
 from trifix.stages.weigh import NoiseOptions
@@ -64,6 +65,8 @@ class Config:
     """What counts as a dot."""
     match: MatchOptions = field(default_factory=MatchOptions)
     """Which dots of the two images may be the same target."""
+    triangulate: TriangulateOptions = field(default_factory=TriangulateOptions)
+    """Where two rays that do not quite meet have their point."""
     noise: NoiseOptions = field(default_factory=NoiseOptions)
     """How noisy the recording is taken to be."""
     identify: IdentifyOptions = field(default_factory=IdentifyOptions)

@@ -193,7 +193,7 @@ class Positioner:
                     if self._epipolar.seen < options.noise.min_samples:
                         self._weigh_pairs(matches)
                 with clock("triangulate"):
-                    points = triangulate(content, matches, frame.rig, self.noise.scale)
+                    points = triangulate(content, matches, frame.rig, self.noise.scale, options.triangulate)
                 return content, matches, points
             case SensorPoints():
                 return None, None, scale_points(content, self.noise)

@@ -7,7 +7,7 @@ from strategies import RIGS, points_before
 from trifix.geometry.camera import StereoRig
 from trifix.geometry.epipolar import essential_matrix
 from trifix.geometry.pose import Pose
-from trifix.geometry.triangulation import linear, midpoint, optimal, triangulate
+from trifix.geometry.triangulation import Method, linear, midpoint, optimal, triangulate, with_covariance
 
 EACH = pytest.mark.parametrize("rig", list(RIGS.values()), ids=list(RIGS))
 SIGMA = 0.3 / 900
@@ -93,27 +93,44 @@ def test_two_iterations_suffice(rig: StereoRig) -> None:
     assert np.abs(two - many).max() < 2e-3
 
 
+LEFT_COV = np.array([[2.0, 0.6], [0.6, 0.5]]) * SIGMA**2
+RIGHT_COV = np.array([[0.7, -0.2], [-0.2, 1.1]]) * SIGMA**2
+
+
 @EACH
-def test_covariance_is_that_of_noisy_dots(rig: StereoRig) -> None:
+@pytest.mark.parametrize(("method", "n"), [(None, 4000), (midpoint, 4000), (linear, 4000), (optimal, 400)])
+def test_covariance_is_that_of_noisy_dots(rig: StereoRig, method: Method | None, n: int) -> None:
     rng = np.random.default_rng(7)
-    n = 4000
     xyz = points_before(rng, n)
     left, right = slopes(rig, xyz)
-    cov_left = np.array([[2.0, 0.6], [0.6, 0.5]]) * SIGMA**2
-    cov_right = np.array([[0.7, -0.2], [-0.2, 1.1]]) * SIGMA**2
-    found, cov = triangulate(
-        rig,
-        left + rng.multivariate_normal(np.zeros(2), cov_left, n),
-        right + rng.multivariate_normal(np.zeros(2), cov_right, n),
-        np.tile(cov_left, (n, 1, 1)),
-        np.tile(cov_right, (n, 1, 1)),
-    )
+    left = left + rng.multivariate_normal(np.zeros(2), LEFT_COV, n)
+    right = right + rng.multivariate_normal(np.zeros(2), RIGHT_COV, n)
+    given = rig, left, right, np.tile(LEFT_COV, (n, 1, 1)), np.tile(RIGHT_COV, (n, 1, 1))
+    found, cov = triangulate(*given) if method is None else with_covariance(method, *given)
     error = found - xyz
     nees = np.einsum("ni,nij,nj->n", error, np.linalg.inv(cov), error)
     # the sum of n chi-square variables of 3 degrees, both tails at one in ten thousand
     assert chdtri(3 * n, 1 - 5e-5) < nees.sum() < chdtri(3 * n, 5e-5)
     for tail in (0.05, 0.95):
         assert abs((nees > chdtri(3, tail)).mean() - tail) < 4 * np.sqrt(0.05 * 0.95 / n)
+
+
+@EACH
+def test_no_method_claims_to_be_better_than_the_weighted_one(rig: StereoRig) -> None:
+    _, left, right = noisy(rig, 100, 8)
+    given = rig, left, right, np.tile(LEFT_COV, (100, 1, 1)), np.tile(RIGHT_COV, (100, 1, 1))
+    least = triangulate(*given, iterations=4)[1]
+    for method in (midpoint, linear, optimal):
+        more = with_covariance(method, *given)[1] - least
+        # less than a part in a hundred below: the covariances are taken at points that differ by the noise
+        assert (np.linalg.eigvalsh(more)[:, 0] > -0.01 * np.linalg.eigvalsh(least)[:, 2]).all()
+
+
+@EACH
+def test_propagated_covariance_of_the_optimum_is_that_of_least_squares(rig: StereoRig) -> None:
+    xyz = points_before(np.random.default_rng(9), 50)
+    given = rig, *slopes(rig, xyz), equal_cov(50), equal_cov(50)
+    np.testing.assert_allclose(with_covariance(optimal, *given)[1], triangulate(*given)[1], rtol=1e-3, atol=1e-6)
 
 
 def test_parallel_and_diverging_rays_give_nan() -> None:

@@ -2,14 +2,16 @@
 
 from dataclasses import replace
 from math import sqrt
+from typing import Literal
 
 import numpy as np
 import pytest
 
 from constellations import PARALLEL, RIG, chi2_limits, seen_dots
+from trifix.geometry import triangulation
 from trifix.geometry.camera import StereoRig
 from trifix.records import Dots, StereoDots, StereoMatches
-from trifix.stages.triangulate import triangulate
+from trifix.stages.triangulate import TriangulateOptions, triangulate
 
 
 def paired(left: list[int], right: list[int]) -> StereoMatches:
@@ -51,6 +53,31 @@ def test_errors_follow_their_covariance(rig: StereoRig, stated_px: float, noise_
         assert abs(share - 0.025) < 4 * sqrt(0.025 * 0.975 / n)
 
 
+@pytest.mark.parametrize("rig", [RIG, PARALLEL], ids=["convergent", "parallel"])
+def test_each_method_is_that_of_geometry(rig: StereoRig):
+    """For dots of equal noise, the weighted optimum is that of Hartley and Sturm; distortion makes it unequal."""
+    rng = np.random.default_rng(7)
+    dots = seen_dots(before_the_sensor(rng, 60), rng, 0.15, rig)
+    slopes = rig.left.unproject(dots.left.uv_px), rig.right.unproject(dots.right.uv_px)
+    matches = paired([*range(60)], [*range(60)])
+    for name, atol_mm in (("optimal", 1e-3 if rig is PARALLEL else 0.02), ("linear", 1e-9), ("midpoint", 1e-9)):
+        points = triangulate(dots, matches, rig, options=TriangulateOptions(method=name))
+        np.testing.assert_allclose(points.xyz_mm, getattr(triangulation, name)(rig, *slopes), atol=atol_mm)
+    np.testing.assert_array_equal(
+        triangulate(dots, matches, rig).xyz_mm,
+        triangulate(dots, matches, rig, options=TriangulateOptions(method="optimal")).xyz_mm,
+    )
+
+
+@pytest.mark.parametrize("method", ["linear", "midpoint"])
+def test_the_noise_scale_is_in_the_covariance_of_every_method(method: Literal["linear", "midpoint"]):
+    rng = np.random.default_rng(8)
+    dots, matches = seen_dots(before_the_sensor(rng, 20), rng, 0.15), paired([*range(20)], [*range(20)])
+    options = TriangulateOptions(method=method)
+    once, twice = (triangulate(dots, matches, RIG, scale, options).cov_mm2 for scale in (1.0, 2.0))
+    np.testing.assert_allclose(twice, 4 * once)
+
+
 def test_dots_of_unequal_noise_are_weighted():
     """One camera ten times as noisy: the error stays what the covariance says, and most of it is the noisy one's."""
     rng = np.random.default_rng(3)
@@ -79,11 +106,14 @@ def test_a_dot_in_several_pairs_gives_several_points():
     assert abs(points.xyz_mm[1, 2] - 400) > 5
 
 
-def test_pairs_that_meet_behind_a_camera_or_nowhere_give_no_point():
+@pytest.mark.parametrize("method", ["optimal", "linear", "midpoint"])
+def test_pairs_that_meet_behind_a_camera_or_nowhere_give_no_point(method: Literal["optimal", "linear", "midpoint"]):
     uv = np.array([[600.0, 500.0]])
     left = Dots.of(np.repeat(uv, 3, axis=0))
     right = Dots.of(uv - [[-50.0, 0.0], [0.0, 0.0], [300.0, 0.0]])  # behind, parallel, before
-    points = triangulate(StereoDots(left, right), paired([0, 1, 2], [0, 1, 2]), PARALLEL)
+    points = triangulate(
+        StereoDots(left, right), paired([0, 1, 2], [0, 1, 2]), PARALLEL, 1.0, TriangulateOptions(method)
+    )
     np.testing.assert_array_equal(points.match, [2])
     np.testing.assert_array_equal(points.row, [0])
     np.testing.assert_allclose(points.xyz_mm[0, 2], 400.0, atol=1e-6)

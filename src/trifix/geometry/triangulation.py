@@ -1,7 +1,8 @@
 """Points from two rays, with their covariance (the paper's part P5).
 
 ``triangulate`` is what the loop uses: the maximum-likelihood point when each dot has a covariance of its own, and the
-covariance of that point. The three methods that the paper names stand beside it, for comparison and as starts:
+covariance of that point. The three methods that the paper names stand beside it, for comparison and as starts;
+``with_covariance`` carries the dots' covariances through any of them:
 
 - ``midpoint``: fast, no noise model; prefer it as a start. It moves when space is moved projectively, so it is poor
   where the two rays have very different lengths.
@@ -9,6 +10,8 @@ covariance of that point. The three methods that the paper names stand beside it
 - ``optimal``: exact for equal, circular noise in both images, without a start and without local minima; prefer it as
   the reference to measure others against, as it is slow.
 """
+
+from collections.abc import Callable
 
 import numpy as np
 from jaxtyping import Float
@@ -40,7 +43,7 @@ def midpoint(
 def linear(
     rig: StereoRig, xy_left: Float[np.ndarray, "n 2"], xy_right: Float[np.ndarray, "n 2"]
 ) -> Float[np.ndarray, "n 3"]:
-    """Sensor coordinates (mm) of the least singular vector of x × (P X) = 0 in both images; NaN where a slope is.
+    """Sensor coordinates (mm) of the least singular vector of x × (P X) = 0 in both images; NaN for parallel rays.
 
     Hartley & Zisserman 2004, section 12.2, homogeneous method; lengths are scaled by the baseline.
     """
@@ -52,8 +55,8 @@ def linear(
     X = np.full((len(A), 4), np.nan)
     ok = np.isfinite(A).all(axis=(1, 2))
     X[ok] = np.linalg.svd(A[ok])[2][:, 3]
-    with np.errstate(divide="ignore", invalid="ignore"):  # parallel rays meet at infinity
-        return np.asarray(X[:, :3] / X[:, 3:] * rig.baseline_mm)
+    X[np.abs(X[:, 3]) < 1e-12] = np.nan  # parallel rays meet at infinity, but for rounding
+    return np.asarray(X[:, :3] / X[:, 3:] * rig.baseline_mm)
 
 
 def optimal(
@@ -107,6 +110,41 @@ def _correct(
         x = move @ turn.T @ foot
         points.append(x[:2] / x[2])
     return np.concatenate(points)
+
+
+Method = Callable[
+    [StereoRig, Float[np.ndarray, "n 2"], Float[np.ndarray, "n 2"]],
+    Float[np.ndarray, "n 3"],
+]
+
+_STEP = 1e-6
+"""Of a slope, for central differences: errors of the differences and of rounding are about equal, and tiny."""
+
+
+def with_covariance(
+    method: Method,
+    rig: StereoRig,
+    xy_left: Float[np.ndarray, "n 2"],
+    xy_right: Float[np.ndarray, "n 2"],
+    cov_left: Float[np.ndarray, "n 2 2"],
+    cov_right: Float[np.ndarray, "n 2 2"],
+) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n 3 3"]]:
+    """What a method finds (mm), and the covariance (mm²) that the errors of the slopes make of it: Σ J C Jᵀ.
+
+    J is the method's own derivative, by central differences, so each gets the covariance that it deserves: that of
+    ``midpoint`` and ``linear`` is never smaller than that of the maximum-likelihood point.
+    """
+    cov = np.zeros((len(xy_left), 3, 3))
+    for side, C in enumerate((cov_left, cov_right)):
+        J = np.empty((len(xy_left), 3, 2))
+        for axis in range(2):
+            step = np.zeros((2, 2))
+            step[side, axis] = _STEP
+            ahead = method(rig, xy_left + step[0], xy_right + step[1])
+            behind = method(rig, xy_left - step[0], xy_right - step[1])
+            J[:, :, axis] = (ahead - behind) / (2 * _STEP)
+        cov += J @ C @ np.swapaxes(J, 1, 2)
+    return method(rig, xy_left, xy_right), cov
 
 
 def triangulate(
