@@ -1,6 +1,7 @@
 """The command line as a stranger meets it: what it prints, where, and with which exit code it leaves."""
 
 import csv
+import inspect
 import io
 import json
 import os
@@ -9,14 +10,18 @@ import signal
 import subprocess
 import sys
 import time
+import tomllib
+from collections.abc import Iterator
 from contextlib import redirect_stderr, redirect_stdout
 from dataclasses import dataclass
 from pathlib import Path
 from typing import get_args
 
 import pytest
+from cyclopts import App
 
 from trifix import cli
+from trifix.console import Json
 
 SMALL = Path(__file__).parent / "data" / "small"
 
@@ -174,6 +179,61 @@ def test_a_run_writes_its_results_and_says_what_it_found(room: Path) -> None:
     assert "noise" in printed
     assert "report.html" in printed.replace("\n", "")
     assert (room / "results" / "report.html").stat().st_size > 1000
+
+
+def commands(app: App, path: tuple[str, ...] = ()) -> Iterator[tuple[str, App]]:
+    """Every command that does something, those of groups among them."""
+    for name in app:
+        if not name.startswith("-"):
+            yield from commands(app[name], (*path, name))
+    if app.default_command is not None and path:
+        yield " ".join(path), app
+
+
+def test_every_command_can_answer_in_json():
+    found = dict(commands(cli.app))
+    assert {"run", "simulate", "demo", "evaluate", "experiment paper", "config", "warmup"} <= found.keys()
+    for name, command in found.items():
+        assert command.default_command is not None
+        option = inspect.signature(command.default_command).parameters.get("json")
+        assert option is not None, f"{name} lacks the option --json: see src/trifix/console.py"
+        assert (option.annotation, option.default) == (Json, False), name
+
+
+def told(*arguments: object) -> dict[str, object]:
+    """The one object that a command prints as JSON."""
+    done = trifix(*arguments, "--json")
+    assert done.code == 0, done.stderr
+    record = json.loads(done.stdout)
+    assert isinstance(record, dict)
+    return record
+
+
+def test_a_run_told_as_json_is_its_summary_and_where_the_report_is(tmp_path: Path):
+    record = told("run", SMALL / "recording", "-o", tmp_path)
+    assert record.pop("report") == str(tmp_path / "report.html")
+    assert record == json.loads((tmp_path / "summary.json").read_text(encoding="utf-8"))
+
+
+def test_an_evaluation_told_as_json_holds_its_figures(room: Path):
+    record = told("evaluate", room / "results", SMALL / "truth")
+    assert (record["positioned"], record["misidentified"]) == (40, [])
+
+
+def test_options_told_as_json_are_those_of_the_toml():
+    record = told("config", "--set", "match.max_depth_mm=900")
+    assert record == tomllib.loads(trifix("config", "--set", "match.max_depth_mm=900").stdout)
+
+
+def test_a_recording_told_as_json_says_where_it_is(tmp_path: Path):
+    record = told("simulate", "demo", "-o", tmp_path, "--frames", 2)
+    assert record["recording"] == str(tmp_path / "recording")
+
+
+def test_a_mistake_is_a_sentence_in_json_mode_too():
+    done = trifix("run", "nowhere", "-o", "out", "--json")
+    assert (done.code, done.stdout) == (1, "")
+    assert done.stderr == "trifix: nowhere is not a folder, expected a recording.\n"
 
 
 def test_results_are_compared_with_the_truth(room: Path) -> None:

@@ -2,6 +2,8 @@
 
 Numerics load when a function first asks for them, so that help and usage errors come at once. What goes wrong is said
 in one sentence on stderr. Exit codes: 0 complete, 1 bad input, 2 usage, 130 interrupted.
+
+A command takes ``json: Json = False`` and ends with ``answer(record, json, for_people)``: see ``console.py``.
 """
 
 import math
@@ -10,28 +12,18 @@ import shlex
 import signal
 import stat
 import sys
+import tomllib
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Annotated, Literal
 
 from cyclopts import App, CycloptsError, Parameter
-from rich.console import Console
-from rich.progress import (
-    BarColumn,
-    MofNCompleteColumn,
-    Progress,
-    ProgressColumn,
-    Task,
-    TaskID,
-    TextColumn,
-    TimeRemainingColumn,
-)
-from rich.table import Table
-from rich.text import Text
+from rich.progress import TaskID
 
 import trifix
+from trifix.console import Json, answer, progress_bar, table_of
 from trifix.errors import MapError, TrifixError
 
 app = App(
@@ -79,6 +71,7 @@ def run(
     target_diameter_mm: float | None = None,
     config: Path | None = None,
     settings: Settings = (),
+    json: Json = False,
 ) -> None:
     """Position every frame of a recording.
 
@@ -124,13 +117,21 @@ def run(
     if given is not None and not len(given):
         raise MapError(f"{map_}: found no target, expected at least three; choose another map or none.")
     frames = trifix.read_recording(recording, level, options.noise.sigma_px)
-    _position(
-        frames, out, options, given, is_map_frozen=given is not None and map_mode != "grow", is_online=online or paper
-    )
+    is_map_frozen = given is not None and map_mode != "grow"
+    _position(frames, out, options, json, given, is_map_frozen, is_online=online or paper)
 
 
 @app.command(sort_key=1)
-def simulate(scene: str, /, *, out: Out, level: Level = "dots", seed: int = 0, frames: int | None = None) -> None:
+def simulate(
+    scene: str,
+    /,
+    *,
+    out: Out,
+    level: Level = "dots",
+    seed: int = 0,
+    frames: int | None = None,
+    json: Json = False,
+) -> None:
     """Make a recording whose truth is known.
 
     Args:
@@ -141,10 +142,12 @@ def simulate(scene: str, /, *, out: Out, level: Level = "dots", seed: int = 0, f
         frames: Number of frames; without it, the scene's own.
     """
     _simulate(scene, out, level, seed, frames)
+    made = {"recording": out / "recording", "truth": out / "truth"}
+    answer({"scene": scene, "level": level, "seed": seed, **made}, json, lambda: None)
 
 
 @app.command(sort_key=2)
-def demo(*, out: Out = Path("demo")) -> None:
+def demo(*, out: Out = Path("demo"), json: Json = False) -> None:
     """Simulate a small recording as images, position it and report on it.
 
     Args:
@@ -152,11 +155,13 @@ def demo(*, out: Out = Path("demo")) -> None:
     """
     if not (out / "truth").is_dir():  # written last: an earlier demo's recording is whole, and would be the same
         _simulate("demo", out, "images")
-    _position(trifix.read_recording(out / "recording"), out / "results", trifix.Config())
+    _position(trifix.read_recording(out / "recording"), out / "results", trifix.Config(), json)
 
 
 @app.command(sort_key=3)
-def evaluate(results: Path, truth: Path, /, *, wrong_mm: float = 3.0, wrong_deg: float = 0.5) -> None:
+def evaluate(
+    results: Path, truth: Path, /, *, wrong_mm: float = 3.0, wrong_deg: float = 0.5, json: Json = False
+) -> None:
     """Compare results with the truth.
 
     Args:
@@ -169,7 +174,8 @@ def evaluate(results: Path, truth: Path, /, *, wrong_mm: float = 3.0, wrong_deg:
         raise CycloptsError(msg="--wrong-mm and --wrong-deg must be positive and finite.")
     from trifix.evaluation import table
 
-    _print_rows(table(trifix.evaluate(results, truth, wrong_mm=wrong_mm, wrong_deg=wrong_deg)))
+    found = trifix.evaluate(results, truth, wrong_mm=wrong_mm, wrong_deg=wrong_deg)
+    answer(found, json, lambda: table_of(table(found)))
 
 
 experiment = App(name="experiment", help="Repeat the paper's experiments on simulated recordings.", sort_key=4)
@@ -185,6 +191,7 @@ def paper(
     frames: int | None = None,
     seed: int = 0,
     workers: int = 2,
+    json: Json = False,
 ) -> None:
     """Try every technique of the paper on its scenes, and show what comes out beside the paper's numbers.
 
@@ -198,11 +205,11 @@ def paper(
         seed: Another seed makes other recordings of the same scenes.
         workers: Processes to work side by side.
     """
-    from trifix.experiments.page import claims_table, write_experiment
+    from trifix.experiments.page import claims, claims_table, write_experiment
     from trifix.experiments.paper import SCENES, TECHNIQUES, run_paper
 
     with ExitStack() as bars:
-        progress = _progress()
+        progress = progress_bar()
         tasks: dict[str, TaskID] = {}
 
         def show(part: str, done: int, of: int) -> None:
@@ -214,11 +221,13 @@ def paper(
 
         parts = run_paper(out, scenes or SCENES, techniques or TECHNIQUES, frames, seed, show, workers)
     page = write_experiment(parts, out, shlex.join(["trifix", *sys.argv[1:]]))
-    Console().print(claims_table(parts, page))
+    misidentified = sum(len(part.misidentified) for part in parts)
+    record = {"claims": claims(parts), "misidentified": misidentified, "page": page}
+    answer(record, json, lambda: claims_table(parts, page))
 
 
 @app.command(sort_key=5)
-def config(*, config: Path | None = None, settings: Settings = ()) -> None:
+def config(*, config: Path | None = None, settings: Settings = (), json: Json = False) -> None:
     """Print the options in effect, each with its meaning, as TOML.
 
     Args:
@@ -227,11 +236,12 @@ def config(*, config: Path | None = None, settings: Settings = ()) -> None:
     """
     from trifix.config import to_toml
 
-    print(to_toml(_options(config, settings)), end="")
+    options = to_toml(_options(config, settings))
+    answer(tomllib.loads(options), json, lambda: print(options, end=""))
 
 
 @app.command(sort_key=6)
-def warmup() -> None:
+def warmup(*, json: Json = False) -> None:
     """Compile the inner loops, once for this machine, so that the first frame need not wait for it."""
     import pkgutil
     from importlib import import_module
@@ -239,9 +249,10 @@ def warmup() -> None:
     from trifix import kernels
 
     names = [f"{kernels.__name__}.{module.name}" for module in pkgutil.iter_modules(kernels.__path__)]
-    with _progress("modules") as progress:
+    with progress_bar("modules") as progress:
         for name in progress.track(names, description="compiling"):
             import_module(name).warm_up()
+    answer({"modules": names}, json, lambda: None)
 
 
 _INTERRUPTED = "interrupted; what was finished until then is whole."
@@ -334,7 +345,7 @@ def _options(
 
 def _simulate(scene: str, out: Path, level: Level, seed: int = 0, frames: int | None = None) -> None:
     """Make a recording; the bar appears with its first frame, so that a refusal stands alone."""
-    progress = _progress()
+    progress = progress_bar()
     task = progress.add_task("simulating")
     with ExitStack() as bar:
 
@@ -350,6 +361,7 @@ def _position(
     recording: "trifix.Recording",
     out: Path,
     options: "trifix.Config",
+    json: bool,
     given: "trifix.ReferenceMap | None" = None,
     is_map_frozen: bool = False,
     is_online: bool = False,
@@ -364,7 +376,7 @@ def _position(
         trifix.ResultsWriter(
             out, recording.path.resolve().name, recording.level, to_toml(options), is_online
         ) as results,
-        _progress() as progress,
+        progress_bar() as progress,
     ):
         with _between_frames() as stop_if_told:
             judged = []
@@ -383,8 +395,9 @@ def _position(
                     report.show(replace(step, frame=frame))  # with its images
                     stop_if_told()
         summary = results.finish()
-    report.write(out / "report.html", summary)
-    Console().print(summary_table(summary, out / "report.html"))
+    page = out / "report.html"
+    report.write(page, summary)
+    answer({**asdict(summary), "report": page}, json, lambda: summary_table(summary, page))
 
 
 @contextmanager
@@ -409,33 +422,3 @@ def _between_frames() -> Iterator[Callable[[], None]]:
     finally:
         for number, handler in before.items():
             signal.signal(number, handler)
-
-
-def _print_rows(rows: list[tuple[str, str]]) -> None:
-    table = Table.grid(padding=(0, 3))
-    for row in rows:
-        table.add_row(*map(Text, row))
-    Console().print(table)
-
-
-class _Rate(ProgressColumn):
-    """How fast it goes."""
-
-    def __init__(self, unit: str) -> None:
-        super().__init__()
-        self._unit = unit
-
-    def render(self, task: Task) -> Text:
-        return Text(f"{task.completed / task.elapsed:.1f} {self._unit}/s" if task.elapsed else "")
-
-
-def _progress(unit: str = "frames") -> Progress:
-    """A progress bar on stderr."""
-    return Progress(
-        TextColumn("{task.description:12}"),
-        BarColumn(),
-        MofNCompleteColumn(),
-        _Rate(unit),
-        TimeRemainingColumn(elapsed_when_finished=True),
-        console=Console(stderr=True),
-    )
