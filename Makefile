@@ -2,11 +2,12 @@
 
 PYTHON ?= python3
 V := .venv
+export NO_MKDOCS_2_WARNING := 1
 UV := $(V)/bin/uv
 LOCKED = $(UV) pip compile -q pyproject.toml --all-extras --group dev --universal \
          --generate-hashes --no-emit-index-url --no-header --no-annotate
 
-.PHONY: setup demo test check bench lock check-lock
+.PHONY: setup demo test check bench docs lock check-lock
 .DEFAULT_GOAL := test
 
 setup: $(V)/.stamp
@@ -37,6 +38,7 @@ check: setup check-lock
 	$(V)/bin/ruff check .
 	$(V)/bin/mypy --strict src
 	$(V)/bin/lint-imports
+	$(V)/bin/mkdocs build -q --strict
 	$(V)/bin/trifix warmup
 	$(V)/bin/python -m pytest -q -n 2 --cov --cov-report=term:skip-covered
 
@@ -44,6 +46,10 @@ check: setup check-lock
 bench: setup
 	$(V)/bin/trifix warmup
 	$(V)/bin/python benchmarks/bench.py
+
+# The site, in site/; nothing in it is loaded from elsewhere.
+docs: setup
+	$(V)/bin/mkdocs build -q --strict
 
 # The newest releases that pyproject.toml allows and the lock file does not hold yet change nothing here.
 lock: setup

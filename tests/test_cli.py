@@ -401,12 +401,13 @@ def test_an_interrupted_run_leaves_whole_lines_and_code_130(
     assert rows(out / "poses.csv", "frame")[: len(positioned)] == positioned
 
 
-def test_the_first_example_runs(tmp_path: Path) -> None:
+@pytest.mark.parametrize(("example", "says"), [("00_first_fix.py", "residual"), ("01_how_far_off.py", "ahead")])
+def test_examples_run(example: str, says: str, tmp_path: Path) -> None:
     shutil.copytree(SMALL, tmp_path / "demo")
-    example = Path(__file__).parent.parent / "examples" / "00_first_fix.py"
-    done = subprocess.run([sys.executable, example], cwd=tmp_path, capture_output=True, text=True, check=False)
+    program = Path(__file__).parent.parent / "examples" / example
+    done = subprocess.run([sys.executable, program], cwd=tmp_path, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
-    assert done.stdout.count("residual") == 40
+    assert done.stdout.count(says) == 40
 
 
 def test_the_readme_shows_the_first_example() -> None:
