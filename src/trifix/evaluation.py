@@ -436,6 +436,8 @@ def evaluate(
     is_misidentified, is_judged = _misidentified(
         frame, estimated, true_poses, errors, targets, identity, labelled, wrong_mm, wrong_deg
     )
+    if is_online:  # the map has moved on since: poses are told by the map of their time
+        is_misidentified &= ~np.isin(frame, list(_frames_identified_rightly(sightings, identity, labelled)))
     is_right = ~is_misidentified
 
     is_trusted = targets.state == TargetState.trusted
@@ -705,6 +707,21 @@ def _identified_rightly(sightings: _Sightings, identity: Mapping[int, int]) -> S
     said = np.array([identity[target] for target in sightings.target.tolist()], dtype=np.int64)
     counts = (said >= 0) | (sightings.label >= 0)
     return Share(int((said == sightings.label)[counts].sum()), int(counts.sum()))
+
+
+def _frames_identified_rightly(
+    sightings: _Sightings, identity: Mapping[int, int], labelled: Mapping[int, _Labelled]
+) -> Iterator[int]:
+    """Frames of three true points or more of whose sightings nine in ten say what they are.
+
+    A pose against another place of the map has them all wrong.
+    """
+    said = np.array([identity[target] for target in sightings.target.tolist()], dtype=np.int64)
+    is_right = said == sightings.label
+    for frame, points in labelled.items():
+        is_here = (sightings.frame == frame) & (sightings.label >= 0)
+        if len(points.id) >= 3 and is_here.any() and is_right[is_here].mean() >= 0.9:
+            yield frame
 
 
 def _sharing(
