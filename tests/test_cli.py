@@ -138,6 +138,7 @@ def test_a_usage_error_is_one_sentence_and_code_2(arguments: list[str], text: st
         (["config", "--set", "match.max_dept_mm=900"], "did you mean match.max_depth_mm?"),
         (["config", "--set", "detect.polarity=green"], '"green", expected one of "auto", "dark", "bright".'),
         (["simulate", "hed", "-o", "out"], "did you mean 'head'?"),
+        (["compare", SMALL, "nowhere"], "holds no summary.json: expected results that `trifix run` wrote."),
     ],
 )
 def test_bad_input_is_one_sentence_and_code_1(
@@ -192,7 +193,7 @@ def commands(app: App, path: tuple[str, ...] = ()) -> Iterator[tuple[str, App]]:
 
 def test_every_command_can_answer_in_json():
     found = dict(commands(cli.app))
-    assert {"run", "simulate", "demo", "evaluate", "experiment paper", "config", "warmup"} <= found.keys()
+    assert {"run", "simulate", "demo", "evaluate", "compare", "experiment paper", "config", "warmup"} <= found.keys()
     for name, command in found.items():
         assert command.default_command is not None
         option = inspect.signature(command.default_command).parameters.get("json")
@@ -218,6 +219,16 @@ def test_a_run_told_as_json_is_its_summary_and_where_the_report_is(tmp_path: Pat
 def test_an_evaluation_told_as_json_holds_its_figures(room: Path):
     record = told("evaluate", room / "results", SMALL / "truth")
     assert (record["positioned"], record["misidentified"]) == (40, [])
+
+
+def test_two_runs_are_compared_in_words_in_json_and_on_a_page(room: Path, tmp_path: Path):
+    out, page = room / "results", tmp_path / "page.html"
+    done = trifix("compare", out, out, "-o", page)
+    assert (done.code, done.stderr) == (0, "")
+    assert "40 by both" in done.stdout
+    assert page.exists()
+    record = told("compare", out, out)
+    assert (record["positioned_by_both"], record["is_aligned"]) == (40, False)
 
 
 def test_options_told_as_json_are_those_of_the_toml():

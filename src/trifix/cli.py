@@ -178,6 +178,31 @@ def evaluate(
     answer(found, json, lambda: table_of(table(found)))
 
 
+@app.command(sort_key=3)
+def compare(
+    first: Path,
+    second: Path,
+    /,
+    *,
+    page: Annotated[Path | None, Parameter(name=["--out", "-o"])] = None,
+    json: Json = False,
+) -> None:
+    """Show two runs of one recording side by side.
+
+    Args:
+        first: Folder that `trifix run` wrote.
+        second: Another of the same recording.
+        page: HTML file to write, with the figures side by side.
+    """
+    from trifix.outputs.comparison import compare_runs, comparison_table, read_run, write_comparison
+
+    runs = read_run(first), read_run(second)
+    found = compare_runs(*runs)
+    if page is not None:
+        write_comparison(found, *runs, page)
+    answer({**asdict(found), "page": page}, json, lambda: comparison_table(found))
+
+
 experiment = App(name="experiment", help="Repeat the paper's experiments on simulated recordings.", sort_key=4)
 app.command(experiment)
 

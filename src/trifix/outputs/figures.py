@@ -120,6 +120,23 @@ def path_figure(course: Course, targets: ReferenceMap) -> str:
         return _svg(figure)
 
 
+def difference_figure(
+    frame: Int[np.ndarray, "n"], mm: Float[np.ndarray, "n"], deg: Float[np.ndarray, "n"], sigmas: Float[np.ndarray, "n"]
+) -> str:
+    """How far the two poses of each frame are apart, by distance, angle and standard deviations; SVG."""
+    rows = ((mm, "Distance (mm)"), (deg, "Angle (degrees)"), (sigmas, "Standard deviations"))
+    with mpl.rc_context(_STYLE):  # type: ignore[arg-type]
+        figure = Figure(figsize=(11, 4.6), layout="constrained")
+        for axes, (value, title) in zip(figure.subplots(len(rows), 1, sharex=True), rows, strict=True):
+            _draw_band(axes, frame, value, PATH)
+            axes.set(title=title, ylim=(0, None))
+            axes.yaxis.set_major_locator(MaxNLocator(4))
+        axes.set(xlabel="frame")
+        axes.xaxis.set_major_locator(MaxNLocator(10, integer=True))
+        axes.margins(x=0.01)
+        return _svg(figure)
+
+
 def _draw_outcome(axes: Axes, course: Course, lanes: Sequence[str]) -> None:
     """One lane an outcome; a bar where consecutive frames have it."""
     outcome = np.array(course.outcome, dtype=object)

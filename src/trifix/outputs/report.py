@@ -9,10 +9,10 @@ from datetime import datetime
 from pathlib import Path
 
 import numpy as np
-from jinja2 import Environment, PackageLoader, StrictUndefined
 
 from trifix.files.tables import write_atomically
 from trifix.outputs.figures import Course, path_figure, time_figure
+from trifix.outputs.page import environment
 from trifix.outputs.samples import KINDS, Samples
 from trifix.outputs.summary import Summary
 from trifix.records import Fix, NoFix, PositionedReason, Reason, ReferenceMap, Step
@@ -58,7 +58,7 @@ class Report:
         course = self._course()
         samples = self._samples.chosen()
         drawn = {kind for each in samples for picture in each.pictures for kind, uv in picture.dots.items() if len(uv)}
-        page = _environment().get_template("report.html.jinja")
+        page = environment().get_template("report.html.jinja")
         text = page.render(
             summary=summary,
             written=datetime.now().astimezone(),
@@ -82,23 +82,3 @@ class Report:
             position_mm=pose[:, :3],
             forward=pose[:, 3:],
         )
-
-
-def _environment() -> Environment:
-    environment = Environment(
-        loader=PackageLoader("trifix.outputs", "."),
-        autoescape=True,
-        undefined=StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-    )
-    environment.filters["words"] = lambda name: name.replace("_", " ")
-    environment.filters["thousands"] = _thousands
-    environment.filters["number"] = lambda value: (
-        "–" if value is None else _thousands(value) if value >= 1000 else f"{value:.3g}"
-    )
-    return environment
-
-
-def _thousands(count: int | float) -> str:
-    return f"{count:,.0f}".replace(",", "\u202f")

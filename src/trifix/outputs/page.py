@@ -1,0 +1,24 @@
+"""What pages share: templates and the way numbers are written. Knows no page."""
+
+from jinja2 import Environment, PackageLoader, StrictUndefined
+
+
+def environment() -> Environment:
+    """Templates of this folder, text escaped, and how pages write numbers."""
+    templates = Environment(
+        loader=PackageLoader("trifix.outputs", "."),
+        autoescape=True,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    templates.filters["words"] = lambda name: name.replace("_", " ")
+    templates.filters["thousands"] = _thousands
+    templates.filters["number"] = lambda value: (
+        "–" if value is None else _thousands(value) if value >= 1000 else f"{value:.3g}"
+    )
+    return templates
+
+
+def _thousands(count: int | float) -> str:
+    return f"{count:,.0f}".replace(",", "\u202f")
