@@ -204,7 +204,9 @@ def test_a_pose_that_single_dots_carry_owes_the_map_what_its_targets_share():
     rows = walk.row_of[targets]
     own = 1e-6 * np.eye(6)
     none = np.zeros(0, dtype=np.int64)
-    dots = SingleDots(np.zeros(len(rows), np.int64), np.arange(len(rows)), rows, np.zeros(len(rows)))
+    c = len(rows)
+    sides = np.zeros(c, np.int64), np.arange(c)
+    dots = SingleDots(*sides, rows, np.zeros(c), np.zeros((c, 3)), np.tile(np.eye(3), (c, 1, 1)))
     fix = Fix(walk.T_true, own, none, none, np.zeros(0), 1e-20, PositionedReason.few_points, single=dots)
     T, cov = walk.joint.settle(walk.map, points, fix)
     assert T is fix.T_world_sensor

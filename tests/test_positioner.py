@@ -444,3 +444,21 @@ def test_points_as_vague_as_they_lie_apart_define_no_world(world: np.ndarray) ->
     vague = replace(points, cov_mm2=points.cov_mm2 * 1e8)
     step = Positioner(is_noise_stated=True).step(frame_of(0, vague))
     assert "are known to" in refused(step, Reason.weak_geometry).detail
+
+
+def test_dots_of_a_single_camera_hold_the_pose_as_well():
+    """On the true map, errors are those that the noise of all dots leaves, not of those that both cameras saw."""
+    simulation = simulate_frames("head-front", 3, "dots", 60)
+    truth = simulation.truth
+    given = ReferenceMap.given(truth.targets.xyz_mm, view=truth.targets.normal, id=truth.targets.id)
+    positioner = Positioner(map=given, is_map_frozen=True, is_noise_stated=True)
+    ratio, single = [], 0
+    for k, step in enumerate(positioner.run(simulation.frames)):
+        if isinstance(step.fix, Fix) and np.isfinite(truth.frames.sigma_position_mm[k]):
+            error = step.fix.T_world_sensor.inverse() @ truth.frames.T_map_sensor[k]
+            ratio.append(np.linalg.norm(error.t_mm) / truth.frames.sigma_position_mm[k])
+            single += len(step.fix.single)
+            assert not set(step.fix.single.target) & set(step.fix.target)
+    assert len(ratio) > 30
+    assert single > len(ratio)
+    assert 0.8 < np.sqrt(np.mean(np.square(ratio))) < 1.2

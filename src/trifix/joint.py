@@ -10,6 +10,8 @@ Lives beside the map and moves its targets; world coordinates are exact by defin
 given map has them. Knows no image and no matching.
 """
 
+from dataclasses import dataclass
+
 import numpy as np
 from jaxtyping import Float, Int
 
@@ -58,34 +60,35 @@ class JointMap:
     def settle(self, map: ReferenceMap, points: SensorPoints, fix: Fix) -> tuple[Pose, Float[np.ndarray, "6 6"]]:
         """The pose of a fix by all that its targets' errors have in common, and its covariance in world coordinates.
 
-        As in verification, targets that are not trusted yet have no say where enough others hold the pose. Where dots
-        of a single camera carry it, the pose stays, and what its targets share is added to its covariance.
+        As in verification, targets that are not trusted yet have no say where enough others hold the pose. Where the
+        motion carries it, the pose stays, and what its targets share is added to its covariance.
         """
         self.follow(map)
-        T, point, target = self._known(points, fix)
-        trusted = np.flatnonzero(map.state[target] == _TRUSTED)
+        seen = self._seen_of(points, fix)
+        if len(fix.point) < _FEWEST or len(seen) < _FEWEST:
+            return fix.T_world_sensor, fix.cov + self._shared(map, fix.T_world_sensor, np.unique(seen.target))
+        trusted = np.flatnonzero(map.state[seen.target] == _TRUSTED)
         if len(trusted) >= _HOLDING:
-            point, target = point[trusted], target[trusted]
-        single = fix.single.target[self._id[fix.single.target] >= 0]
-        if len(single) or len(point) < _FEWEST:
-            return T, fix.cov + self._shared(map, T, np.unique(np.concatenate([target, single])))
-        self._recall(target)
-        delta, cov, _, _ = self._condition(map, points, T, point, target, 0)
-        return T @ Pose.exp(delta), cov
+            seen = seen.rows(trusted)
+        self._recall(seen.target)
+        delta, cov, _, _ = self._condition(map, fix.T_world_sensor, seen, 0)
+        return fix.T_world_sensor @ Pose.exp(delta), cov
 
     def learn(self, map: ReferenceMap, points: SensorPoints, fix: Fix) -> "Knowledge":
         """Moves the targets by what a fix tells of them, and returns the pose with what its error owes to theirs."""
         self.follow(map)
         self._frames += 1
-        T, point, target = self._known(points, fix)
-        if len(point) < _FEWEST:
-            return Knowledge(T, fix.cov, np.zeros((6, len(self._P))))
-        self._seen[target] = self._frames
-        self._make_room(target)
-        self._recall(target)
-        delta, cov, cross, shift = self._condition(map, points, T, point, target, self._used)
+        seen = self._seen_of(points, fix)
+        if len(fix.point) < _FEWEST or len(seen) < _FEWEST:
+            return Knowledge(fix.T_world_sensor, fix.cov, np.zeros((6, len(self._P))))
+        self._seen[seen.target] = self._frames
+        self._make_room(seen.target)
+        self._recall(seen.target)
+        delta, cov, cross, shift = self._condition(map, fix.T_world_sensor, seen, self._used)
         self._move(map, shift)
-        return Knowledge(T @ Pose.exp(delta), cov, np.pad(cross, ((0, 0), (0, len(self._P) - self._used))))
+        return Knowledge(
+            fix.T_world_sensor @ Pose.exp(delta), cov, np.pad(cross, ((0, 0), (0, len(self._P) - self._used)))
+        )
 
     def enter(
         self,
@@ -154,31 +157,32 @@ class JointMap:
         """Rows and columns of P that blocks have taken."""
         return 3 * len(self._row)
 
-    def _known(self, points: SensorPoints, fix: Fix) -> tuple[Pose, Int[np.ndarray, "c"], Int[np.ndarray, "c"]]:
-        """The pose, and the points whose targets are known here; if those are too many, as many as can be held.
+    def _seen_of(self, points: SensorPoints, fix: Fix) -> "_Seen":
+        """What a fix shows of the targets known here; if those are too many, as many as can be held.
 
         Those that are held come first, as putting targets away and recalling them costs knowledge; then the surest.
         """
-        known = np.flatnonzero(self._id[fix.target] >= 0)
+        one = fix.single
+        seen = _Seen(
+            np.concatenate([fix.target, one.target]),
+            np.concatenate([points.xyz_mm[fix.point], one.xyz_mm]),
+            np.concatenate([points.cov_mm2[fix.point], one.cov_mm2]),
+        )
+        known = np.flatnonzero(self._id[seen.target] >= 0)
         if len(known) > self._capacity:
-            sigma2 = np.trace(points.cov_mm2[fix.point[known]], axis1=1, axis2=2)
-            is_away = self._block[fix.target[known]] < 0
+            sigma2 = np.trace(seen.cov_mm2[known], axis1=1, axis2=2)
+            is_away = self._block[seen.target[known]] < 0
             known = known[np.lexsort((sigma2, is_away))[: self._capacity]]
-        return fix.T_world_sensor, fix.point[known], fix.target[known]
+        return seen if len(known) == len(seen) else seen.rows(known)
 
     def _condition(
-        self,
-        map: ReferenceMap,
-        points: SensorPoints,
-        T: Pose,
-        point: Int[np.ndarray, "c"],
-        target: Int[np.ndarray, "c"],
-        used: int,
+        self, map: ReferenceMap, T: Pose, seen: "_Seen", used: int
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-        places, R, t = floats(map.xyz_mm[target]), floats(T.R), floats(T.t_mm)
-        r, noise = kernels.residuals(places, floats(points.xyz_mm[point]), floats(points.cov_mm2[point]), R, t)
+        places, R, t = floats(map.xyz_mm[seen.target]), floats(T.R), floats(T.t_mm)
+        r, noise = kernels.residuals(places, floats(seen.xyz_mm), floats(seen.cov_mm2), R, t)
         H = kernels.pose_fields(places, R, t)
-        delta, cov, cross, shift = kernels.condition(self._P, used, integers(self._block[target]), noise, H, r, -1.0)
+        blocks = integers(self._block[seen.target])
+        delta, cov, cross, shift = kernels.condition(self._P, used, blocks, noise, H, r, -1.0)
         return delta, cov, cross, shift
 
     def _shared(self, map: ReferenceMap, T: Pose, rows: Int[np.ndarray, "r"]) -> Float[np.ndarray, "6 6"]:
@@ -317,6 +321,24 @@ class JointMap:
         )
         self._seen = np.pad(self._seen, (0, more))
         self._own, self._xyz = np.pad(self._own, ((0, more), (0, 0), (0, 0))), np.pad(self._xyz, ((0, more), (0, 0)))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Seen:
+    """Points, and rays of single dots, whose targets are known."""
+
+    target: Int[np.ndarray, "c"]
+    """Rows of the targets."""
+    xyz_mm: Float[np.ndarray, "c 3"]
+    """Where they were seen, sensor coordinates (mm)."""
+    cov_mm2: Float[np.ndarray, "c 3 3"]
+    """Covariance of that (mm²)."""
+
+    def __len__(self) -> int:
+        return len(self.target)
+
+    def rows(self, rows: Int[np.ndarray, "r"]) -> "_Seen":
+        return _Seen(self.target[rows], self.xyz_mm[rows], self.cov_mm2[rows])
 
 
 class Knowledge:

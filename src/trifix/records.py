@@ -4,7 +4,7 @@ Arrays are read-only by agreement. A later record names rows of an earlier one b
 the way. Units are in the names; coordinates are ``sensor`` (left camera: x right, y down, z forward) or ``world``.
 """
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from enum import Enum, IntEnum
 
 import numpy as np
@@ -16,6 +16,8 @@ from trifix.geometry.pose import Pose
 GreyOrColour = (
     UInt8[np.ndarray, "_ _"] | UInt16[np.ndarray, "_ _"] | UInt8[np.ndarray, "_ _ 3"] | UInt16[np.ndarray, "_ _ 3"]
 )
+
+_RAY = 0.3  # standard deviation of a single dot's target along the ray, in depths: as good as unknown
 
 
 class Reason(Enum):
@@ -319,15 +321,23 @@ class SingleDots:
     """Row of the target that it is."""
     residual_px: Float[np.ndarray, "s"]
     """Distance of the dot from the image of its target (px)."""
+    xyz_mm: Float[np.ndarray, "s 3"]
+    """Where the ray of the dot passes its target, sensor coordinates (mm)."""
+    cov_mm2: Float[np.ndarray, "s 3 3"]
+    """Its covariance (mm²), noise scale applied: that of a point of which nothing but the direction is known."""
 
     def __len__(self) -> int:
         return len(self.camera)
+
+    def rows(self, rows: Int[np.ndarray, "r"] | Bool[np.ndarray, "s"]) -> "SingleDots":
+        """Some of the dots."""
+        return SingleDots(*(getattr(self, each.name)[rows] for each in fields(self)))
 
     @staticmethod
     def none() -> "SingleDots":
         """No such dots."""
         nothing = np.zeros(0, dtype=np.int64)
-        return SingleDots(nothing, nothing, nothing, np.zeros(0))
+        return SingleDots(nothing, nothing, nothing, np.zeros(0), np.zeros((0, 3)), np.zeros((0, 3, 3)))
 
     @staticmethod
     def of(
@@ -338,15 +348,25 @@ class SingleDots:
         rig: StereoRig,
         T_world_sensor: Pose,
         map: ReferenceMap,
+        noise_scale: float = 1.0,
     ) -> "SingleDots":
         """These dots as these targets, their residuals measured from the pose."""
         in_left = T_world_sensor.inverse().apply(map.xyz_mm[target])
-        uv_left, uv_right = rig.left.project(in_left), rig.right.project(rig.T_right_left.apply(in_left))
-        residual_px = np.zeros(len(dot))
-        for side, (uv, seen) in enumerate(((uv_left, dots.left), (uv_right, dots.right))):
-            rows = camera == side
-            residual_px[rows] = np.linalg.norm(uv[rows] - seen.uv_px[dot[rows]], axis=1)
-        return SingleDots(camera, dot, target, residual_px)
+        residual_px, xyz_mm, cov_mm2 = np.zeros(len(dot)), np.zeros((len(dot), 3)), np.zeros((len(dot), 3, 3))
+        for side, (by, seen, T) in enumerate(
+            ((rig.left, dots.left, Pose.identity()), (rig.right, dots.right, rig.T_right_left))
+        ):
+            rows = np.flatnonzero(camera == side)
+            place, own = T.apply(in_left[rows]), dot[rows]
+            residual_px[rows] = np.linalg.norm(by.project(place) - seen.uv_px[own], axis=1)
+            slope = by.unproject(seen.uv_px[own])
+            depth, ray = place[:, 2], np.c_[slope, np.ones(len(rows))]
+            A = depth[:, None, None] * by.unproject_jacobian(slope)
+            C = np.einsum("ni,nj,n->nij", ray, ray, (_RAY * depth) ** 2)
+            C[:, :2, :2] += noise_scale**2 * A @ seen.cov_px2[own] @ A.transpose(0, 2, 1)
+            xyz_mm[rows] = T.inverse().apply(ray * depth[:, None])
+            cov_mm2[rows] = T.R.T @ C @ T.R
+        return SingleDots(camera, dot, target, residual_px, xyz_mm, cov_mm2)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -397,10 +417,12 @@ class Fix:
         rows, single_rows = rows_of(self.target), rows_of(self.single.target)
         point, target = self.point[rows >= 0], rows[rows >= 0]
         residual = map.xyz_mm[target] - self.T_world_sensor.apply(points.xyz_mm[point])
-        single, stays = SingleDots.none(), single_rows >= 0
+        single = SingleDots.none()
         if dots is not None and rig is not None:
-            camera, dot = self.single.camera[stays], self.single.dot[stays]
-            single = SingleDots.of(camera, dot, single_rows[stays], dots, rig, self.T_world_sensor, map)
+            single = replace(self.single, target=single_rows).rows(single_rows >= 0)
+            T = self.T_world_sensor
+            again = SingleDots.of(single.camera, single.dot, single.target, dots, rig, T, map)
+            single = replace(single, residual_px=again.residual_px)
         residual_mm = np.linalg.norm(residual, axis=1)
         return replace(self, point=point, target=target, residual_mm=residual_mm, single=single)
 

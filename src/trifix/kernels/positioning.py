@@ -802,6 +802,33 @@ def _refine(R, t, P, frame, scene, matched, dots, cams, dot_target, prior, gate,
 
 
 @njit(cache=True, nogil=True)
+def add_dots(R, t, P, frame, matched, dots, cams, scene, alive, cell_mm, gate):
+    """The pose with the dots that no pair of it claims and that it takes to a target: (target of each dot, d², mm).
+
+    ``R``, ``t``, ``P`` and ``matched`` change in place; where the pose cannot be solved anew, the first is empty.
+    """
+    _, _, left, right = frame
+    n, most = len(matched), 1
+    for p in range(n):
+        most = max(most, left[p] + 1, right[p] + 1)
+    for p in range(len(dots[1])):
+        most = max(most, dots[1][p] + 1)
+    used = (np.zeros(most, np.bool_), np.zeros(most, np.bool_))
+    used_target = np.zeros(len(scene[0]), np.bool_)
+    for p in range(n):
+        if matched[p] >= 0:
+            used[0][left[p]] = used[1][right[p]] = used_target[matched[p]] = True
+    dot_target = np.full(len(dots[0]), -2, np.int64)
+    log_ratio = np.zeros(len(CLUTTER_SHARES))
+    d2, residual_mm = np.full(n, np.nan), np.full(n, np.nan)
+    grow_by_dots(R, t, P, dots, used, cams, scene, used_target, alive, cell_mm, gate, dot_target, log_ratio)
+    nowhere = (np.eye(3), np.zeros(3), np.zeros((6, 6)))
+    if not _refine(R, t, P, frame, scene, matched, dots, cams, dot_target, nowhere, gate, d2, residual_mm):
+        return dot_target[:0], d2, residual_mm
+    return dot_target, d2, residual_mm
+
+
+@njit(cache=True, nogil=True)
 def _likelihood(R, frame, scene, matched, d2, cell_mm, log_ratio):
     """ln of the likelihood of all points at one pose, against chance, a clutter share each: to compare poses by."""
     S, Q, D = np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3))
@@ -1280,6 +1307,8 @@ def warm_up() -> None:
     windows = (*cams, np.ones((2, 6)))
     prior = (np.eye(3), np.zeros(3), np.eye(6))
     own = np.zeros(len(triangles))
+    at = np.eye(3), np.zeros(3), np.eye(6)
+    add_dots(*at, (xyz, cov, none, none), none.copy(), dots, cams, scene, zero, 0.1, 4.0)
     solve(
         *oriented[:4],
         own,

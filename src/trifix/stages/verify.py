@@ -38,6 +38,7 @@ from trifix.records import (
     SingleDots,
     StereoDots,
     StereoMatches,
+    TargetState,
 )
 
 
@@ -219,7 +220,7 @@ def verify(
     if distorted := weighed.is_distorted(best):
         detail = f"{len(best.point)} points agree with the map; {distorted}, more would."
         return NoFix(Reason.not_proven, detail, 1.0, len(best.point), best.rms_mm)
-    fix = weighed.fix(best)
+    fix = weighed.fix(weighed.with_single_dots(best))
     seen_mm = map.xyz_mm[np.concatenate([fix.target, fix.single.target])]
     sigma_mm, sigma_deg = pose_sigma(fix.cov, fix.T_world_sensor.inverse().apply(seen_mm))
     if sigma_mm > options.max_sigma_mm or sigma_deg > options.max_sigma_deg:
@@ -487,6 +488,40 @@ class _Weighed:
         found = weighed.candidates(Identification(none, none), as_it_is, (), 0.0)
         return any(len(each.point) > len(best.point) and each.log_likelihood > best.log_likelihood for each in found)
 
+    def with_single_dots(self, best: Solution) -> Solution:
+        """A solution and the dots of a single camera that it takes to trusted targets: these hold the pose as well."""
+        if self._evidence.dots is None or self._evidence.rig is None or len(self._dots[0]) or len(best.point) < 3:
+            return best
+        self._dots, self._cameras = _all_dots(self._evidence)
+        T, matched = best.T_world_sensor, best.matched.copy()
+        trusted = np.flatnonzero(self._map.state == TargetState.trusted)
+        ahead = T.inverse().apply(self._map.xyz_mm[trusted])
+        trusted = trusted[np.abs(ahead[:, :2]).max(axis=1, initial=0.0) < _WIDEST_SLOPE * ahead[:, 2]]
+        R, t, cov, cell_mm = T.R.copy(), T.t_mm.copy(), best.cov.copy(), self._index.grid[3]
+        dot_target, _, residual_mm = kernels.add_dots(
+            R,
+            t,
+            cov,
+            self._frame,
+            matched,
+            self._dots,
+            self._cameras,
+            self._scene,
+            trusted,
+            cell_mm,
+            self._options.gate_sigmas,
+        )
+        point = np.flatnonzero(matched >= 0)
+        if not (dot_target >= 0).any() or len(point) < len(best.point):  # a dot that drives out a point is none
+            return best
+        return replace(
+            best,
+            T_world_sensor=Pose(R, t),
+            cov=cov,
+            dot_target=dot_target,
+            residual_mm=residual_mm[point],
+        )
+
     def fix(self, best: Solution) -> Fix:
         """A solution as the answer."""
         fix = Fix(
@@ -502,7 +537,8 @@ class _Weighed:
         if len(seen) and evidence.dots is not None and evidence.rig is not None:
             camera, dot = self._dots[0][seen], self._dots[1][seen]
             target, T = best.dot_target[seen], best.T_world_sensor
-            fix = replace(fix, single=SingleDots.of(camera, dot, target, evidence.dots, evidence.rig, T, self._map))
+            sensed = evidence.dots, evidence.rig, T, self._map, evidence.noise_scale
+            fix = replace(fix, single=SingleDots.of(camera, dot, target, *sensed))
         if len(best.point) < 3:
             detail = f"{len(best.point)} points and {len(seen)} dots of a single camera, near where the motion leads."
             fix = replace(fix, reason=PositionedReason.few_points, detail=detail)
