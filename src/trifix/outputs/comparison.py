@@ -22,7 +22,8 @@ from trifix.files.maps import read_map
 from trifix.files.tables import read_table, write_atomically
 from trifix.files.trajectories import read_poses
 from trifix.geometry.pose import Pose
-from trifix.outputs.figures import Course, difference_figure, path_figure, time_figure
+from trifix.outputs.course import Course
+from trifix.outputs.figures import difference_figure, path_figure, time_figure
 from trifix.outputs.page import environment
 from trifix.outputs.summary import Summary
 from trifix.records import PositionedReason, Reason, ReferenceMap
@@ -200,6 +201,7 @@ def read_run(path: Path) -> Run:
         matched=table["matched"],
         residual_mm=np.where([T is None for T in of_frame], np.nan, table.get("residual_mm", np.full(n, np.nan))),
         position_mm=np.array([nowhere if T is None else T.t_mm for T in of_frame]).reshape(n, 3),
+        down=np.array([nowhere if T is None else T.R[:, 1] for T in of_frame]).reshape(n, 3),
         forward=np.array([nowhere if T is None else T.R[:, 2] for T in of_frame]).reshape(n, 3),
     )
     return Run(

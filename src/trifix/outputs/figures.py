@@ -1,9 +1,9 @@
-"""The report's two figures, as SVG that takes its colours from the page. Draws arrays; knows no Step and no file."""
+"""The figures of reports and comparisons, as SVG that takes its colours from the page. Knows no Step and no file."""
 
 import io
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import replace
 
 import matplotlib as mpl
 import numpy as np
@@ -13,6 +13,7 @@ from matplotlib.backends.backend_svg import FigureCanvasSVG
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
+from trifix.outputs.course import Course, object_axes
 from trifix.records import ReferenceMap, TargetState
 
 # Drawn in these colours, which occur nowhere else, and then replaced by the page's variables.
@@ -49,31 +50,6 @@ _MOST_BINS = 600  # more cannot be told apart on a page
 _MOST_VERTICES = 2000
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Course:
-    """What became of n frames, in the order of the recording."""
-
-    frame: Int[np.ndarray, "n"]
-    """Number of the frame."""
-    outcome: Sequence[str]
-    """Name of the reason of each refused frame; "positioned" for the others."""
-    points: Int[np.ndarray, "n"]
-    """Points seen."""
-    matched: Int[np.ndarray, "n"]
-    """Points identified."""
-    residual_mm: Float[np.ndarray, "n"]
-    """Rms residual of the identified points (mm); NaN where refused."""
-    position_mm: Float[np.ndarray, "n 3"]
-    """Where the sensor was, world coordinates (mm); NaN where refused."""
-    forward: Float[np.ndarray, "n 3"]
-    """Where it looked, unit vectors in world coordinates; NaN where refused."""
-
-    @property
-    def is_positioned(self) -> Bool[np.ndarray, "n"]:
-        """Which frames have a pose."""
-        return np.asarray(np.isfinite(self.position_mm[:, 0]))
-
-
 def time_figure(course: Course) -> str:
     """Outcome, residual and number of points of every frame, one above the other; SVG."""
     matched = np.where(course.is_positioned, course.matched, np.nan)
@@ -101,20 +77,24 @@ def time_figure(course: Course) -> str:
 
 
 def path_figure(course: Course, targets: ReferenceMap) -> str:
-    """Targets and the sensor's path from the front (x, y) and from above (x, z); SVG."""
+    """Targets and the sensor's path from the front and from above, as the paper draws its scenes (4-3 to 4-6); SVG."""
+    axes_of_object = object_axes(course, targets)
+    course, targets = _turned(course, targets, axes_of_object)
     centre, half = _what_matters(course, targets)
     half[0] = max(half[0], 0.8 * half[1:].max())
     half[1:] = np.maximum(half[1:], 0.4 * half[0])
     with mpl.rc_context(_STYLE):  # type: ignore[arg-type]
         figure = Figure(figsize=(11, 4.9 * half[1:].max() / half[0] + 1.0), layout="constrained")
         front, above = figure.subplots(1, 2)
-        for axes, row, title in ((front, 1, "From the front"), (above, 2, "From above")):
+        for axes, row, title, name in (
+            (front, 1, "From the front", "up"),
+            (above, 2, "From above", "away"),
+        ):
             _draw_targets(axes, targets, row)
             _draw_path(axes, course, row)
-            axes.set(title=title, xlabel="x (mm)", ylabel=f"{'xyz'[row]} (mm)", aspect="equal", anchor="N")
+            axes.set(title=title, xlabel="right (mm)", ylabel=f"{name} (mm)", aspect="equal", anchor="N")
             axes.set_xlim(centre[0] - half[0], centre[0] + half[0])
             axes.set_ylim(centre[row] - half[row], centre[row] + half[row])
-        front.invert_yaxis()  # y points down
         handles, labels = front.get_legend_handles_labels()
         figure.legend(handles, labels, loc="outside lower center", ncols=max(len(labels), 1), labelcolor=INK)
         return _svg(figure)
@@ -215,6 +195,15 @@ def _draw_path(axes: Axes, course: Course, row: int) -> None:
     )  # fmt: skip
     axes.plot(*xy[found[0]], marker="o", ms=8, mfc="none", mec=PATH, mew=1.8, linestyle="", label="first frame")
     axes.plot(*xy[found[-1]], marker="s", ms=6, mfc=PATH, mec="none", linestyle="", label="last frame")
+
+
+def _turned(course: Course, targets: ReferenceMap, axes: Float[np.ndarray, "3 3"]) -> tuple[Course, ReferenceMap]:
+    """Path and targets in coordinates right, up, away, measured from the middle of the targets."""
+    R = axes * [[1.0], [-1.0], [1.0]]
+    shown = targets.xyz_mm[targets.state == TargetState.trusted]
+    centre = shown.mean(axis=0) if len(shown) else np.zeros(3)
+    turned = replace(course, position_mm=(course.position_mm - centre) @ R.T, forward=course.forward @ R.T)
+    return turned, replace(targets, xyz_mm=(targets.xyz_mm - centre) @ R.T)
 
 
 def _what_matters(course: Course, targets: ReferenceMap) -> tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3"]]:
