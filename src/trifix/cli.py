@@ -404,9 +404,12 @@ def _position(
         progress_bar() as progress,
     ):
         with _between_frames() as stop_if_told:
-            judged = []
+            judged, is_doubt_told = [], False
             for step in progress.track(positioner.run(recording), len(recording), description="positioning"):
                 results.write(step)
+                if results.doubt and not is_doubt_told:
+                    is_doubt_told = True
+                    progress.console.print(Text(results.doubt, "yellow"))
                 stop_if_told()
                 if is_online:
                     report.show(step)

@@ -12,6 +12,7 @@ Nothing depends on the clock but timings.csv and summary.json.
 import shutil
 import threading
 import time
+import tomllib
 from functools import partial
 from itertools import chain
 from pathlib import Path
@@ -21,6 +22,7 @@ import msgspec
 import numpy as np
 from jaxtyping import Float
 
+from trifix.config import Config, with_values
 from trifix.errors import RecordingError
 from trifix.files.maps import write_map, write_ply
 from trifix.files.recordings import DOTS_HEADER, Level, dots_rows
@@ -29,6 +31,7 @@ from trifix.files.trajectories import POSES_HEADER, poses_row, tum_row
 from trifix.geometry.camera import Camera
 from trifix.outputs.summary import STAGES, Summary, Tally
 from trifix.records import Fix, NoFix, Reason, ReferenceMap, Step
+from trifix.rigcheck import RigCheck
 
 FLUSH_S = 0.25
 """Longest wait of a row in memory (s)."""
@@ -70,6 +73,7 @@ class ResultsWriter:
         self._level = level
         self._new_tally = partial(Tally, recording_name, level, config_toml, is_online)
         self._tally = self._new_tally()
+        self._rig_check = RigCheck(with_values(Config(), tomllib.loads(config_toml), "options").match)
         self._map = ReferenceMap.empty()
         self._island_maps: dict[int, ReferenceMap] = {}
         self._dots_written = 0
@@ -114,6 +118,8 @@ class ResultsWriter:
             RecordingError: earlier rows could not be written.
         """
         self._complain()
+        if self._folder == self._out:  # once is enough
+            self._rig_check.watch(step)
         sightings, residual_px = self._sightings(step)
         rows = {
             "sightings.csv": sightings,
@@ -164,12 +170,18 @@ class ResultsWriter:
             self._island_maps = {}
         self._dots_written = 0
 
+    @property
+    def doubt(self) -> str:
+        """What seems to be wrong with the rig so far; empty if nothing does."""
+        return self._rig_check.sentence
+
     def finish(self) -> Summary:
         """Close the files of a run that reached its end; what it amounts to.
 
         Raises:
             RecordingError: something could not be written.
         """
+        self._rig_check.finish()
         self._is_finished = True
         self._close()
         self._complain()
@@ -238,7 +250,10 @@ class ResultsWriter:
         with self._lock:
             targets, islands = self._map, dict(self._island_maps)
             self._summary = self._tally.summary(
-                targets, time.monotonic() - self._start, finished=self._is_finished and self._closing.is_set()
+                targets,
+                time.monotonic() - self._start,
+                finished=self._is_finished and self._closing.is_set(),
+                rig=self._rig_check.sentence,
             )
         for number, there in islands.items():
             folder = self._folder / _ISLANDS / str(number)

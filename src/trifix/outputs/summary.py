@@ -70,6 +70,8 @@ class Summary:
     """Distances of identified dots from their reprojected targets (px); none if the recording begins with points."""
     noise_scale: float
     """Factor on all stated or assumed standard deviations that the residuals asked for."""
+    rig: str
+    """What seems to be wrong with the rig, in a sentence; empty if nothing does."""
     timings: dict[str, Timing]
     """Per stage, in the order of the work, and ``total``."""
     seconds: float
@@ -110,8 +112,8 @@ class Tally:
             self._timings_ms[stage].append(ms)
         self._noise_scale = step.noise_scale
 
-    def summary(self, targets: ReferenceMap, seconds: float, finished: bool) -> Summary:
-        """The numbers so far, with the map as it now is."""
+    def summary(self, targets: ReferenceMap, seconds: float, finished: bool, rig: str = "") -> Summary:
+        """The numbers so far, with the map as it now is, and what is wrong with the rig."""
         return Summary(
             recording=self._recording,
             level=self._level,
@@ -128,6 +130,7 @@ class Tally:
             residual_mm=self._mm.residuals(),
             residual_px=self._px.residuals(),
             noise_scale=self._noise_scale,
+            rig=rig,
             timings={
                 name: Timing(float(np.median(ms)), float(np.percentile(ms, 99)), len(ms))
                 for name, ms in self._timings_ms.items()

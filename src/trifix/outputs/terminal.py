@@ -31,4 +31,5 @@ def summary_table(summary: Summary, report: Path) -> Group:
     if total := summary.timings.get("total"):
         table.add_row("time a frame", f"{total.median_ms:.1f}", f"ms  99 % below {total.p99_ms:.1f}")
     table.add_row("in all", f"{summary.seconds:.1f}", f"s  {summary.frames_per_s:.1f} frames/s")
-    return Group(table, Text(), Text.assemble("report  ", (str(report), "bold")))
+    warning = [Text(), Text(summary.rig, "bold yellow")] if summary.rig else []
+    return Group(table, *warning, Text(), Text.assemble("report  ", (str(report), "bold")))
