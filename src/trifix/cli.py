@@ -21,6 +21,7 @@ from typing import Annotated, Literal
 
 from cyclopts import App, CycloptsError, Parameter
 from rich.progress import TaskID
+from rich.text import Text
 
 import trifix
 from trifix.console import Json, answer, progress_bar, table_of
