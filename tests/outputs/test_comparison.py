@@ -147,6 +147,7 @@ def test_the_page_shows_both_runs_and_asks_nothing_of_the_network(made: list[Ste
     assert text.count("<svg xmlns") == 5
     words = " ".join(" ".join(page.words).split())
     assert f"Targets and path: {tmp_path / 'one'}" in words
+    assert page.tags.count("canvas") == 2
     assert "50, 10 more judged by one run only" in words
 
 

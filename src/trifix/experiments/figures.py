@@ -24,7 +24,7 @@ from trifix.stages.identify.delaunay import DelaunayTriangles
 from trifix.stages.identify.minimal import MinimalTriangles
 
 _PAGE, _INK, _FAINT, _GRID = "#fefefe", "#1b1f24", "#66707c", "#dde1e6"
-_GOOD, _BAD, _PATH, _SOFT = "#0072b2", "#d55e00", "#00855f", "#cfe3f1"
+_GOOD, _BAD, _PATH, _SOFT = "#0072b2", "#d55e00", "#0b5c36", "#cfe3f1"
 _VARIABLES = {
     _PAGE: "card", _INK: "ink", _FAINT: "faint", _GRID: "grid", _GOOD: "good", _BAD: "bad", _PATH: "path",
     _SOFT: "soft",

@@ -25,6 +25,7 @@ from trifix.geometry.pose import Pose
 from trifix.outputs.course import Course
 from trifix.outputs.figures import difference_figure, path_figure, time_figure
 from trifix.outputs.page import environment
+from trifix.outputs.space import space_of
 from trifix.outputs.summary import Summary
 from trifix.records import PositionedReason, Reason, ReferenceMap
 
@@ -56,6 +57,8 @@ class Run:
     """Covariance of each pose (mm, rad)."""
     map: ReferenceMap
     """The targets."""
+    identified: tuple[Int[np.ndarray, "_"], ...]
+    """Identities of the targets that each frame showed."""
 
     @property
     def world(self) -> int | None:
@@ -213,6 +216,7 @@ def read_run(path: Path) -> Run:
         poses=by_frame,
         cov=dict(zip(frames.tolist(), covs, strict=True)),
         map=read_map(path / "map.csv"),
+        identified=_identified(path / "sightings.csv", table["frame"]),
     )
 
 
@@ -382,6 +386,7 @@ def write_comparison(comparison: Comparison, first: Run, second: Run, path: Path
                 {
                     "path": run.path,
                     "is_finished": run.summary.finished,
+                    "space": space_of(run.course, run.map, None, run.identified),
                     "time_figure": time_figure(run.course) if len(run.course.frame) else "",
                     "path_figure": path_figure(run.course, run.map) if len(run.course.frame) else "",
                 }
@@ -408,6 +413,14 @@ def _read_summary(file: Path) -> Summary:
         raise RecordingError(f"{file} cannot be read: {fault.strerror}.") from None
     except msgspec.DecodeError as fault:
         raise RecordingError(f"{file} is no summary of a run ({fault}): run the recording again.") from None
+
+
+def _identified(file: Path, frames: Int[np.ndarray, "n"]) -> tuple[Int[np.ndarray, "_"], ...]:
+    """Targets that were identified in each of the frames, each once."""
+    sightings = read_table(file, {"frame": int, "target": int})
+    frame, target = np.unique(np.stack([sightings["frame"], sightings["target"]]), axis=1)
+    first, end = np.searchsorted(frame, frames), np.searchsorted(frame, frames, side="right")
+    return tuple(target[a:b] for a, b in zip(first.tolist(), end.tolist(), strict=True))
 
 
 def _common_frames(first: Run, second: Run) -> list[int]:

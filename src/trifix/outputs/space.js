@@ -1,7 +1,9 @@
 // Draws each .space of the page on a canvas: targets with their ellipsoids, the path of the sensor, its cameras.
 // The numbers come from space.py and stand in the page. Coordinates: world (mm); in view, x right, y down, z away.
+// Several on one page turn, zoom and step through the frames together.
 "use strict";
-for (const section of document.querySelectorAll(".space")) space(section);
+const spaces = [];
+for (const section of document.querySelectorAll(".space")) spaces.push(space(section));
 
 function space(section) {
   const find = (selector) => section.querySelector(selector);
@@ -289,15 +291,26 @@ function space(section) {
     tip.style.top = (top + tip.offsetHeight > height ? found.y - tip.offsetHeight - 12 : top) + "px";
   }
 
-  function choose(k) {
+  function choose(k, isTold) {
     chosen = Math.min(Math.max(k, 0), poses - 1);
+    if (!isTold) others((other) => other.follow(path.frame[chosen]));
     slider.value = chosen;
     slider.setAttribute("aria-valuetext", ofPose(chosen));
     readout.textContent = ofPose(chosen);
     redraw();
   }
 
-  function move(change) {
+  function follow(frame) { // the last pose up to that of another run
+    const after = path.frame.findIndex((each) => each > frame);
+    if (poses) choose(after < 0 ? poses - 1 : after - 1, true);
+  }
+
+  function others(tell) {
+    for (const each of spaces) if (each.section !== section) tell(each);
+  }
+
+  function move(change, isTold) {
+    if (!isTold) others((other) => other.move({ ...change, x: 0, y: 0 }, true));
     if (change.yaw) view.yaw += change.yaw;
     if (change.pitch) view.pitch = Math.min(Math.max(view.pitch + change.pitch, -Math.PI / 2), Math.PI / 2);
     if (change.x || change.y) {
@@ -358,10 +371,11 @@ function space(section) {
     event.preventDefault();
   });
 
-  function show(name) {
+  function show(name, isTold) {
+    if (!isTold) others((other) => other.show(name, true));
     const around = name === "targets" && ofTargets ? ofTargets : whole;
     Object.assign(view, VIEWS[name], { centre: around.middle, zoom: reach / Math.max(around.radius, 0.02 * reach) });
-    move({});
+    move({}, true);
   }
 
   for (const button of section.querySelectorAll("button")) button.addEventListener("click", () => show(button.value));
@@ -377,10 +391,11 @@ function space(section) {
   section.querySelector(".spacing").textContent = `grid ${step} mm`;
   section.hidden = false;
   readColours();
-  if (poses) choose(0);
+  if (poses) choose(0, true);
   matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => {
     readColours();
     redraw();
   });
   new ResizeObserver(redraw).observe(canvas);
+  return { section, move, show, follow };
 }
