@@ -28,15 +28,22 @@ def poses(
 
 
 def views(
-    T_left_board: list[Pose], columns: int, rows: int, pitch_mm: float, sigma_px: float, rng: np.random.Generator
+    T_left_board: list[Pose],
+    columns: int,
+    rows: int,
+    pitch_mm: float,
+    sigma_px: float,
+    rng: np.random.Generator,
+    board_mm: float = 0.0,
+    rig: StereoRig = RIG,
 ) -> list[BoardView]:
-    """What the rig sees of the points of a board, where it sees them."""
+    """What a rig sees of the points of a board, where it sees them; the points may be out of place."""
     cell = np.stack(np.meshgrid(np.arange(columns), np.arange(rows)), axis=-1).reshape(-1, 2)
-    xyz = np.c_[cell * pitch_mm, np.zeros(len(cell))]
+    xyz = np.c_[cell * pitch_mm, np.zeros(len(cell))] + board_mm * rng.standard_normal((len(cell), 3))
     found = []
     for k, T in enumerate(T_left_board):
         both = []
-        for camera, T_camera_board in ((RIG.left, T), (RIG.right, RIG.T_right_left @ T)):
+        for camera, T_camera_board in ((rig.left, T), (rig.right, rig.T_right_left @ T)):
             seen = camera.sees(T_camera_board.apply(xyz))
             uv = camera.project(T_camera_board.apply(xyz[seen]))
             both.append(Sighting(cell[seen], uv + sigma_px * rng.standard_normal(uv.shape), np.zeros(len(uv))))

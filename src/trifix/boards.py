@@ -57,8 +57,8 @@ class Board:
         if self.target == "charuco":
             if not 0 < self.marker_mm < self.pitch_mm:
                 raise ConfigError(
-                    f"the markers are {self.marker_mm:g} mm and the squares {self.pitch_mm:g} mm wide, expected markers "
-                    f"that fit into the squares (--marker-mm, --square-mm)."
+                    f"the markers are {self.marker_mm:g} mm and the squares {self.pitch_mm:g} mm wide, expected "
+                    f"markers that fit into the squares (--marker-mm, --square-mm)."
                 )
             if not (self.dictionary.startswith("DICT_") and hasattr(cv2.aruco, self.dictionary)):
                 known = sorted(name for name in dir(cv2.aruco) if name.startswith("DICT_"))
@@ -119,8 +119,8 @@ def find_views(
             size = (image.shape[1], image.shape[0])
             if sizes.setdefault(side, size) != size:
                 raise CalibrationError(
-                    f"{file}: this {side} image is {size[0]} x {size[1]} pixels, those before it are {sizes[side][0]} x "
-                    f"{sizes[side][1]}; expected images of one size from each camera."
+                    f"{file}: this {side} image is {size[0]} x {size[1]} pixels, those before it are "
+                    f"{sizes[side][0]} x {sizes[side][1]}; expected images of one size from each camera."
                 )
         files = pairs.files(k)
         names.append(f"{k}" if files == pairs.files(looked[0]) and k else f"{k} ({files[0].name})")
@@ -147,7 +147,7 @@ class _Found:
 
 
 def _views(names: Sequence[str], found: Sequence[tuple[_Found, _Found]]) -> list[BoardView]:
-    """What was found, counted alike in both images of a pair, and without boards whose rings differ from the others'."""
+    """What was found, counted alike in both images of a pair; without boards whose rings differ from the others'."""
     legs = Counter(each.legs for pair in found for each in pair if each.ways)
     usual = legs.most_common(1)[0][0] if legs else None
     views = []
@@ -212,7 +212,8 @@ def _find_chessboard(grey: UInt8[np.ndarray, "h w"], board: Board) -> list[Sight
 def _is_first_dark(grey: UInt8[np.ndarray, "h w"], grid: Float[np.ndarray, "r c 2"]) -> bool:
     """Whether the square right below the first corner is one of the dark ones."""
     middle = (grid[:-1, :-1] + grid[:-1, 1:] + grid[1:, :-1] + grid[1:, 1:]) / 4
-    values = cv2.remap(grey, middle.astype(np.float32), None, cv2.INTER_LINEAR).astype(float)
+    u, v = np.moveaxis(middle.astype(np.float32), -1, 0)
+    values = np.asarray(cv2.remap(grey, u, v, cv2.INTER_LINEAR), dtype=float)
     is_first = np.indices(values.shape).sum(axis=0) % 2 == 0
     return bool(values[is_first].mean() < values[~is_first].mean())
 

@@ -16,7 +16,7 @@ from jaxtyping import Bool, Float, Float32, Int
 from trifix.errors import CalibrationError
 from trifix.geometry.camera import Camera, StereoRig, distort
 from trifix.geometry.epipolar import essential_matrix
-from trifix.geometry.pose import Pose, skew
+from trifix.geometry.pose import Pose
 
 LEAST_VIEWS = 3
 """Fewer poses of a flat board do not determine a camera (Zhang 2000, section 3.1)."""
@@ -30,13 +30,19 @@ _CAMERA = 8  # parameters of a camera; six of the pose follow those of both
 _RIG = 2 * _CAMERA + 6
 _SETTLED = 1e-10  # relative decrease of the cost below which the minimum is reached
 
+# OpenCV 4 keeps them in its module for these lenses, OpenCV 5 with all others; their values differ.
+_FISHEYE_FLAGS = sum(
+    getattr(cv2.fisheye, name, getattr(cv2, name, 0))
+    for name in ("CALIB_RECOMPUTE_EXTRINSIC", "CALIB_FIX_SKEW", "CALIB_FIX_K3", "CALIB_FIX_K4")
+)
+
 Model = Literal["radtan", "equidistant"]
 
 PARAMETERS = tuple(
     f"{side}.{name}" for side in ("left", "right") for name in ("fu", "fv", "pu", "pv", "c1", "c2", "c3", "c4")
 ) + tuple(f"T_right_left.{name}" for name in ("x", "y", "z", "rx", "ry", "rz"))
-"""What the rows of the covariance are: intrinsics (px) and distortion coefficients of both cameras, and δ = (mm, rad) of
-T_right_left · exp(δ)."""
+"""Rows of the covariance: intrinsics (px) and distortion coefficients of both cameras; δ = (mm, rad) of T_right_left ·
+exp(δ)."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -91,7 +97,11 @@ class Calibration:
     rig: StereoRig
     """The rig."""
     cov: Float[np.ndarray, "22 22"]
-    """Covariance of ``PARAMETERS``, from the residuals taken as independent and alike."""
+    """Covariance of ``PARAMETERS``, for errors in the images and on the board as large as the residuals tell."""
+    image_sigma_px: float
+    """Standard deviation per coordinate of a point in an image (px)."""
+    board_sigma_mm: float
+    """Standard deviation per coordinate of a point on the board (mm), from what its images have in common."""
     views: tuple[BoardView, ...]
     """All views that were given."""
     is_left_out: Bool[np.ndarray, "v"]
@@ -169,27 +179,37 @@ def calibrate(
     pairs = sum(view.is_pair for view in views)
     if pairs < LEAST_VIEWS:
         raise CalibrationError(
-            f"both cameras see the board in {pairs} of {len(views)} image pairs, expected at least {LEAST_VIEWS}, better "
-            f"15: hold the board so that both see it, and tilt it differently for each."
+            f"both cameras see the board in {pairs} image pairs, expected at least {LEAST_VIEWS}, better 15: hold the "
+            f"board so that both see it, and tilt it differently for each."
         )
     observed = _Observed.of(views, pitch_mm)
     is_kept = np.ones(len(views), dtype=bool)
     while True:
-        kept = np.flatnonzero(is_kept)
+        kept = np.flatnonzero(is_kept).tolist()
         rig = _start([views[v] for v in kept], pitch_mm, left_size_px, right_size_px, model)
         poses = [_board_pose(rig, view, pitch_mm) for view in views]
         observed = observed.with_radius(rig, poses)
-        rig, poses, cov = _adjust(rig, poses, observed, is_kept)
+        rig, poses = _adjust(rig, poses, observed, is_kept)
         error_px = _errors(rig, poses, observed)
         rms_px = np.array([_rms(error_px[observed.view == v]) for v in range(len(views))])
-        worst = kept[rms_px[kept].argmax()]
+        worst = max(kept, key=lambda v: float(rms_px[v]))
         is_enough = sum(views[v].is_pair for v in kept if v != worst) >= max(LEAST_VIEWS, pairs / 2)
         if not (may_leave_out and is_enough and rms_px[worst] > OUTLIER * np.median(rms_px[kept])):
             break
         is_kept[worst] = False
-    _refuse_vague(rig, cov, len(kept))
+    uncertainty = _uncertainty(rig, poses, observed, is_kept)
+    _refuse_vague(rig, uncertainty.cov, len(kept))
     residuals = Residuals(observed.view, observed.camera, observed.cell, observed.uv_px, error_px)
-    return Calibration(rig, cov, tuple(views), ~is_kept, tuple(poses), residuals)
+    return Calibration(
+        rig,
+        uncertainty.cov,
+        uncertainty.image_sigma_px,
+        uncertainty.board_sigma_mm,
+        tuple(views),
+        ~is_kept,
+        tuple(poses),
+        residuals,
+    )
 
 
 def _refuse_vague(rig: StereoRig, cov: Float[np.ndarray, "22 22"], views: int) -> None:
@@ -198,8 +218,9 @@ def _refuse_vague(rig: StereoRig, cov: Float[np.ndarray, "22 22"], views: int) -
     vague = np.sqrt(np.diag(cov)[[0, 1, _CAMERA, _CAMERA + 1]]) / focal_px
     if not vague.max() <= _WORST_FOCAL:
         raise CalibrationError(
-            f"the {views} views leave a focal length uncertain by {100 * vague.max():.3g} % (one sigma), expected at most "
-            f"{100 * _WORST_FOCAL:g} %: they are too much alike; tilt the board by 20 to 45 degrees about different axes."
+            f"the {views} views leave a focal length uncertain by {100 * vague.max():.3g} % (one sigma), expected at "
+            f"most {100 * _WORST_FOCAL:g} %: they are too much alike; tilt the board by 20 to 45 degrees about "
+            f"different axes."
         )
 
 
@@ -237,14 +258,14 @@ class _Observed:
         )
 
     def with_radius(self, rig: StereoRig, poses: Sequence[Pose]) -> "_Observed":
-        """The same, the dots as large as most of them look: the long semi-axis of a tilted circle's image is r f / z."""
+        """The same, the dots as large as most of them look: a tilted circle's image has the long semi-axis r f / z."""
         xyz = _in_cameras(rig, poses, self)[0]
         focal_px = np.array([np.sqrt(c.fu_px * c.fv_px) for c in (rig.left, rig.right)])[self.camera]
         return replace(self, radius_mm=float(np.median(self.radius_px * xyz[:, 2] / focal_px)))
 
 
 def _on_board(cell: Int[np.ndarray, "n 2"], pitch_mm: float) -> Float[np.ndarray, "n 3"]:
-    return np.c_[cell * pitch_mm, np.zeros(len(cell))]
+    return np.asarray(np.c_[cell * pitch_mm, np.zeros(len(cell))])
 
 
 def _common(left: Sighting, right: Sighting) -> tuple[Int[np.ndarray, "n"], Int[np.ndarray, "n"]]:
@@ -294,14 +315,12 @@ def _start_camera(
     sightings: Sequence[Sighting | None], pitch_mm: float, size_px: tuple[int, int], model: Model
 ) -> Camera:
     seen = [each for each in sightings if each is not None]
-    xyz = [_on_board(each.cell, pitch_mm).astype(np.float32)[:, None] for each in seen]
-    uv = [each.uv_px.astype(np.float32)[:, None] for each in seen]
+    xyz = [_on_board(each.cell, pitch_mm).astype(np.float32)[None] for each in seen]
+    uv = [each.uv_px.astype(np.float32)[None] for each in seen]
     if model == "equidistant":
-        flags = cv2.fisheye.CALIB_RECOMPUTE_EXTRINSIC | cv2.fisheye.CALIB_FIX_SKEW
         _, K, coefficients, *_ = cv2.fisheye.calibrate(
-            [x.astype(float) for x in xyz], [x.astype(float) for x in uv], size_px, np.eye(3), np.zeros((4, 1)), None,
-            None, flags,
-        )  # fmt: skip
+            xyz, uv, size_px, np.eye(3), np.zeros((4, 1)), None, None, _FISHEYE_FLAGS
+        )
     else:
         _, K, coefficients, *_ = cv2.calibrateCamera(xyz, uv, size_px, np.eye(3), np.zeros(5), flags=cv2.CALIB_FIX_K3)
     c1, c2, c3, c4 = np.ravel(coefficients)[:4].tolist()
@@ -330,7 +349,7 @@ def _start_pose(views: Sequence[BoardView], pitch_mm: float, left: Camera, right
     none = np.zeros(5)
     found = cv2.stereoCalibrateExtended(
         xyz, uv_left, uv_right, left.K, none, right.K, none.copy(), size_px, np.eye(3), np.zeros(3),
-        flags=cv2.CALIB_FIX_INTRINSIC,
+        flags=cv2.CALIB_FIX_INTRINSIC, criteria=(cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 20, 1e-4),
     )  # fmt: skip
     return Pose(np.asarray(found[5], dtype=float), np.ravel(found[6]).astype(float))
 
@@ -370,8 +389,8 @@ def _board_pose(rig: StereoRig, view: BoardView, pitch_mm: float) -> Pose:
 
 def _adjust(
     rig: StereoRig, poses: list[Pose], observed: _Observed, is_kept: Bool[np.ndarray, "v"]
-) -> tuple[StereoRig, list[Pose], Float[np.ndarray, "22 22"]]:
-    """Least squares over rig and poses (Levenberg-Marquardt, the poses eliminated), and the rig's covariance.
+) -> tuple[StereoRig, list[Pose]]:
+    """Least squares over rig and poses (Levenberg-Marquardt, the poses eliminated).
 
     Views left out have no say in the rig; their poses follow it.
     """
@@ -392,17 +411,75 @@ def _adjust(
         rig, poses, cost, damping = tried_rig, tried, tried_cost, damping / 10
         if decrease < _SETTLED:
             break
-    has_say = is_kept[observed.view]
-    freedom = 2 * int(has_say.sum()) - _RIG - 6 * int(is_kept.sum())
+    return rig, poses
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Uncertainty:
+    """How wrong images and board are, and the rig for it."""
+
+    cov: Float[np.ndarray, "22 22"]
+    image_sigma_px: float
+    board_sigma_mm: float
+
+
+def _uncertainty(
+    rig: StereoRig, poses: Sequence[Pose], observed: _Observed, is_kept: Bool[np.ndarray, "v"]
+) -> _Uncertainty:
+    """Covariance of the rig where points err in the images, each by itself, and on the board, in all images alike.
+
+    Residuals are r = M (ε + G d), with errors ε in the images (σ per coordinate), d on the board (τ), G the derivative
+    of pixels by places on the board, and M = I − J (JᵀJ)⁻¹ Jᵀ. With K = G Gᵀ the two variances follow from
+
+        E rᵀ r   = σ² tr M   + τ² tr MK
+        E rᵀ K r = σ² tr MK  + τ² tr MKMK
+
+    and the covariance of all unknowns is σ² (JᵀJ)⁻¹ + τ² (JᵀJ)⁻¹ Jᵀ K J (JᵀJ)⁻¹.
+    """
+    kept = np.flatnonzero(is_kept).tolist()
+    error_px = _errors(rig, poses, observed)
+    cells, place = np.unique(observed.cell, axis=0, return_inverse=True)
+    unknowns, n = _RIG + 6 * len(kept), 3 * len(cells)
+    JJ, JG, GG, Gr = np.zeros((unknowns, unknowns)), np.zeros((unknowns, n)), np.zeros((n, n)), np.zeros(n)
+    coordinates, squares = 0, 0.0
+    for k, v in enumerate(kept):
+        own = np.r_[:_RIG, _RIG + 6 * k : _RIG + 6 * k + 6]
+        for camera in (0, 1):
+            rows = np.flatnonzero((observed.view == v) & (observed.camera == camera))
+            J_rig, J_pose = _jacobians(rig, poses[v], camera, observed.xyz_mm[rows])
+            J, G = np.c_[J_rig, J_pose], np.zeros((2 * len(rows), n))
+            for axis in range(3):  # shifts the point as a shift of the board would: the pose's first columns
+                G[np.arange(2 * len(rows)), 3 * np.repeat(place.ravel()[rows], 2) + axis] = J_pose[:, axis]
+            e = error_px[rows].ravel()
+            JJ[np.ix_(own, own)] += J.T @ J
+            JG[own] += J.T @ G
+            GG += G.T @ G
+            Gr += G.T @ e
+            coordinates += len(e)
+            squares += float(e @ e)
+    freedom = coordinates - unknowns
     if freedom <= 0:
         raise CalibrationError(
-            f"{int(has_say.sum())} points in {int(is_kept.sum())} views are too few to calibrate from: take more views."
+            f"{coordinates // 2} points in {len(kept)} views are too few to calibrate from: take more views."
         )
-    reduced = _reduced(_linearise(rig, poses, observed, is_kept), 0.0)[0]
-    scale = 1 / np.sqrt(np.diag(reduced).clip(1e-300))  # or the units would decide what is singular
-    values, vectors = np.linalg.eigh(reduced * scale * scale[:, None])
-    spread = vectors / np.sqrt(np.maximum(values, 1e-14)) * scale[:, None]
-    return rig, poses, np.asarray(cost / freedom * spread @ spread.T)
+    P = _inverse(JJ)
+    W = GG - JG.T @ P @ JG  # Gᵀ M G
+    moments = np.array([[freedom, np.trace(W)], [np.trace(W), np.sum(W**2)]])
+    image, board = (float(x) for x in np.linalg.solve(moments, np.array([squares, Gr @ Gr])))
+    if board < 0 or image < 0:  # nothing speaks for errors of the board
+        image, board = squares / freedom, 0.0
+    spread = (P @ JG)[:_RIG]
+    return _Uncertainty(
+        image * P[:_RIG, :_RIG] + board * spread @ spread.T, float(np.sqrt(image)), float(np.sqrt(board))
+    )
+
+
+def _inverse(A: Float[np.ndarray, "n n"]) -> Float[np.ndarray, "n n"]:
+    """Inverse of normal equations; very large, not infinite, along what they leave undetermined."""
+    scale = 1 / np.sqrt(np.diag(A).clip(1e-300))  # or the units would decide what is undetermined
+    values, vectors = np.linalg.eigh(A * scale * scale[:, None])
+    half = scale[:, None] * vectors / np.sqrt(np.maximum(values, 1e-14))
+    return np.asarray(half @ half.T)
 
 
 _System = tuple[
@@ -455,7 +532,11 @@ def _jacobians(
 
 def _moving(xyz_mm: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3 6"]:
     """d(exp(δ) p) / dδ at δ = 0: [I, −[p]×]."""
-    return np.array([np.c_[np.eye(3), -skew(p)] for p in xyz_mm]).reshape(-1, 3, 6)
+    J = np.zeros((len(xyz_mm), 3, 6))
+    J[:, [0, 1, 2], [0, 1, 2]] = 1.0
+    J[:, [0, 1, 2], [4, 5, 3]] = xyz_mm[:, [2, 0, 1]]
+    J[:, [0, 1, 2], [5, 3, 4]] = -xyz_mm[:, [1, 2, 0]]
+    return J
 
 
 def _camera_jacobian(camera: Camera, xyz_mm: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 2 8"]:

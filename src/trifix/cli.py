@@ -25,7 +25,7 @@ from rich.text import Text
 
 import trifix
 from trifix.console import Json, answer, progress_bar, table_of
-from trifix.errors import MapError, TrifixError
+from trifix.errors import MapError, RecordingError, TrifixError
 
 app = App(
     name="trifix",
@@ -145,6 +145,79 @@ def simulate(
     _simulate(scene, out, level, seed, frames)
     made = {"recording": out / "recording", "truth": out / "truth"}
     answer({"scene": scene, "level": level, "seed": seed, **made}, json, lambda: None)
+
+
+@app.command(sort_key=2)
+def calibrate(
+    recording: Path,
+    /,
+    *,
+    out: Out,
+    target: Literal["chessboard", "charuco", "dots"],
+    columns: int = 0,
+    rows: int = 0,
+    square_mm: float | None = None,
+    marker_mm: float | None = None,
+    dictionary: str = "DICT_4X4_50",
+    pitch_mm: float | None = None,
+    rings: bool = False,
+    model: Literal["radtan", "equidistant"] = "radtan",
+    every: int = 1,
+    keep_all: bool = False,
+    json: Json = False,
+) -> None:
+    """Calibrate the sensor from a recording of a board.
+
+    Args:
+        recording: Folder with the images of both cameras; a calibration.yaml in it is not read.
+        out: Folder for calibration.yaml, calibration.json and the page calibration.html.
+        target: What is on the board.
+        columns: Inner corners in a row (one fewer than squares), or dots in a row.
+        rows: Inner corners in a column, or dots in a column.
+        square_mm: Side of a square of a chessboard or ChArUco board (mm).
+        marker_mm: Side of a marker of a ChArUco board (mm).
+        dictionary: OpenCV's name of the ChArUco markers' dictionary.
+        pitch_mm: Distance between the centres of neighbouring dots (mm).
+        rings: Three dots are rings, one at a corner, one in its row and one in its column; the grid may then reach
+            beyond the images, and columns and rows need not be told.
+        model: Distortion model of both cameras.
+        every: Look at every so many pairs; for videos.
+        keep_all: Give views a say whose residuals stand out.
+    """
+    length_mm, name = (pitch_mm, "--pitch-mm") if target == "dots" else (square_mm, "--square-mm")
+    is_counted = target == "dots" and rings
+    missing = [
+        name
+        for name, is_there in (
+            (name, length_mm is not None),
+            ("--columns", columns or is_counted),
+            ("--rows", rows or is_counted),
+            ("--marker-mm", marker_mm is not None or target != "charuco"),
+        )
+        if not is_there
+    ]
+    if missing:
+        raise CycloptsError(msg=f"--target {target} needs {' and '.join(missing)}.")
+    if rings and target != "dots":
+        raise CycloptsError(msg="--rings says that three dots are rings: it goes with --target dots.")
+    if every < 1:
+        raise CycloptsError(msg="--every must be at least 1.")
+    from trifix.boards import Board, find_views
+    from trifix.calibration import calibrate as solve
+    from trifix.files.images import read_image_pairs
+    from trifix.outputs.calibrations import calibration_table, record_of, summarise, write_calibration
+
+    board = Board(target, length_mm or 0.0, columns, rows, marker_mm or 0.0, dictionary, rings)
+    if not recording.is_dir():
+        raise RecordingError(f"{recording} is not a folder, expected a recording of images.")
+    pairs = read_image_pairs(recording)
+    with progress_bar("pairs") as progress:
+        task = progress.add_task("looking")
+        search = find_views(pairs, board, every, lambda done, of: progress.update(task, completed=done, total=of))
+    found = solve(search.views, board.pitch_mm, search.left_size_px, search.right_size_px, model, not keep_all)
+    summary = summarise(found, search, board, recording.resolve().name)
+    write_calibration(found, summary, out)
+    answer(record_of(summary, out), json, lambda: calibration_table(summary, out))
 
 
 @app.command(sort_key=2)

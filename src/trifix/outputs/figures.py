@@ -20,7 +20,7 @@ from trifix.records import ReferenceMap, TargetState
 INK, FAINT, GRID, GOOD, BAD, PATH = (f"#0102{k:02x}" for k in range(1, 7))
 _VARIABLES = {INK: "ink", FAINT: "faint", GRID: "grid", GOOD: "good", BAD: "bad", PATH: "path"}
 
-_STYLE = {
+STYLE = {
     "svg.fonttype": "none",  # text stays text
     "svg.hashsalt": "trifix",  # the same figure has the same bytes
     "font.family": "sans-serif",
@@ -55,7 +55,7 @@ def time_figure(course: Course) -> str:
     matched = np.where(course.is_positioned, course.matched, np.nan)
     lanes = sorted(set(course.outcome) - {"positioned"}, key=course.outcome.count, reverse=True)
     lane_height = 0.24 * (len(lanes) + 1)
-    with mpl.rc_context(_STYLE):  # type: ignore[arg-type]
+    with mpl.rc_context(STYLE):  # type: ignore[arg-type]
         figure = Figure(figsize=(11, lane_height + 3.9), layout="constrained")
         outcome, residual, points = figure.subplots(3, 1, sharex=True, height_ratios=[lane_height, 1.5, 1.5])
         _draw_outcome(outcome, course, ["positioned", *lanes])
@@ -73,7 +73,7 @@ def time_figure(course: Course) -> str:
         points.xaxis.set_major_locator(MaxNLocator(10, integer=True))
         points.margins(x=0.01)
         points.legend(loc="lower right", bbox_to_anchor=(1, 1), ncols=2, borderaxespad=0, labelcolor=INK)
-        return _svg(figure)
+        return svg_of(figure)
 
 
 def path_figure(course: Course, targets: ReferenceMap) -> str:
@@ -83,7 +83,7 @@ def path_figure(course: Course, targets: ReferenceMap) -> str:
     centre, half = _what_matters(course, targets)
     half[0] = max(half[0], 0.8 * half[1:].max())
     half[1:] = np.maximum(half[1:], 0.4 * half[0])
-    with mpl.rc_context(_STYLE):  # type: ignore[arg-type]
+    with mpl.rc_context(STYLE):  # type: ignore[arg-type]
         figure = Figure(figsize=(11, 4.9 * half[1:].max() / half[0] + 1.0), layout="constrained")
         front, above = figure.subplots(1, 2)
         for axes, row, title, name in (
@@ -97,7 +97,7 @@ def path_figure(course: Course, targets: ReferenceMap) -> str:
             axes.set_ylim(centre[row] - half[row], centre[row] + half[row])
         handles, labels = front.get_legend_handles_labels()
         figure.legend(handles, labels, loc="outside lower center", ncols=max(len(labels), 1), labelcolor=INK)
-        return _svg(figure)
+        return svg_of(figure)
 
 
 def difference_figure(
@@ -105,7 +105,7 @@ def difference_figure(
 ) -> str:
     """How far the two poses of each frame are apart, by distance, angle and standard deviations; SVG."""
     rows = ((mm, "Distance (mm)"), (deg, "Angle (degrees)"), (sigmas, "Standard deviations"))
-    with mpl.rc_context(_STYLE):  # type: ignore[arg-type]
+    with mpl.rc_context(STYLE):  # type: ignore[arg-type]
         figure = Figure(figsize=(11, 4.6), layout="constrained")
         for axes, (value, title) in zip(figure.subplots(len(rows), 1, sharex=True), rows, strict=True):
             _draw_band(axes, frame, value, PATH)
@@ -114,7 +114,7 @@ def difference_figure(
         axes.set(xlabel="frame")
         axes.xaxis.set_major_locator(MaxNLocator(10, integer=True))
         axes.margins(x=0.01)
-        return _svg(figure)
+        return svg_of(figure)
 
 
 def _draw_outcome(axes: Axes, course: Course, lanes: Sequence[str]) -> None:
@@ -232,7 +232,7 @@ def _with_lone_points(
     return x[row] + 1e-3 * is_double, y[row]
 
 
-def _svg(figure: Figure) -> str:
+def svg_of(figure: Figure) -> str:
     """The figure as an SVG element whose colours are the page's variables, without a style sheet of its own."""
     text = io.StringIO()
     FigureCanvasSVG(figure)

@@ -1,7 +1,7 @@
 """Images of flat calibration boards, made so that the truth of what they show is known.
 
-Rays are undistorted and cut with the board; a pixel through which an edge passes is the mean over many of them. Then come
-blur and noise. Knows neither how boards are found nor how a rig is calibrated.
+Rays are undistorted and cut with the board; a pixel through which an edge passes is the mean over many of them. Then
+come blur and noise. Knows neither how boards are found nor how a rig is calibrated.
 """
 
 from collections.abc import Callable
