@@ -106,9 +106,7 @@ def test_what_is_missing_is_a_usage_error(arguments: tuple[str, ...], text: str,
 
 def test_another_board_than_was_shown_is_told(recording: Path, tmp_path: Path) -> None:
     other = ("--target", "chessboard", "--columns", "9", "--rows", "6", "--square-mm", "16")
-    with pytest.raises(
-        TrifixError, match="found no board in 2 image pairs; expected a chessboard of 9 x 6 inner"
-    ):
+    with pytest.raises(TrifixError, match="found no board in 2 image pairs; expected a chessboard of 9 x 6 inner"):
         cli.app(["calibrate", str(recording), "-o", str(tmp_path / "out"), *other, "--every", "4"])
     assert not (tmp_path / "out").exists()
 
