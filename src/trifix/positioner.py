@@ -41,7 +41,7 @@ from trifix.records import (
 from trifix.stages.detect import detect
 from trifix.stages.identify import Identifier
 from trifix.stages.match import match
-from trifix.stages.triangulate import triangulate
+from trifix.stages.triangulate import correct_eccentricity, triangulate
 from trifix.stages.update import distinct, stored
 from trifix.stages.verify import Evidence
 from trifix.stages.weigh import (
@@ -115,8 +115,8 @@ class Positioner:
     def _judge(self, frame: Frame, learns: bool) -> Step:
         """The loop's body: sense, position, learn."""
         clock, events, added = Stopwatch(), list[Event](), NOTHING
-        dots, matches, points = self._sense(frame, clock)
-        evidence = None if points is None else Evidence.of(points, matches, dots, frame.rig, self.noise.scale)
+        dots, matches, centres, points = self._sense(frame, clock)
+        evidence = None if points is None else Evidence.of(points, matches, centres, frame.rig, self.noise.scale)
         island, identification, fix = self._position(frame, evidence, clock)
         there: Fix | None = fix if isinstance(fix, Fix) else None
         told = self._told(island, points, there, clock)
@@ -161,6 +161,7 @@ class Positioner:
             events=tuple(events),
             timings_ms=clock.ms,
             elsewhere=elsewhere,
+            centres=centres,
         )
 
     def _told(
@@ -174,8 +175,8 @@ class Positioner:
 
     def _sense(
         self, frame: Frame, clock: Stopwatch
-    ) -> tuple[StereoDots | None, StereoMatches | None, SensorPoints | None]:
-        """Images to dots to pairs to points; each level of a recording enters at its own stage."""
+    ) -> tuple[StereoDots | None, StereoMatches | None, StereoDots | None, SensorPoints | None]:
+        """Images to dots to pairs to centres to points; each level of a recording enters at its own stage."""
         options = self.config
         content = frame.content
         if isinstance(content, StereoImages):
@@ -193,12 +194,15 @@ class Positioner:
                     if self._epipolar.seen < options.noise.min_samples:
                         self._weigh_pairs(matches)
                 with clock("triangulate"):
-                    points = triangulate(content, matches, frame.rig, self.noise.scale, options.triangulate)
-                return content, matches, points
+                    centres, scale = content, self.noise.scale
+                    if options.triangulate.correct_eccentricity:
+                        centres = correct_eccentricity(content, matches, frame.rig, scale)
+                    points = triangulate(centres, matches, frame.rig, scale, options.triangulate)
+                return content, matches, centres, points
             case SensorPoints():
-                return None, None, scale_points(content, self.noise)
+                return None, None, None, scale_points(content, self.noise)
             case Unusable():
-                return None, None, None
+                return None, None, None, None
             case _:
                 assert_never(content)
 
@@ -383,7 +387,7 @@ class Positioner:
             earlier = placed.get(k, step)
             is_first = isinstance(earlier.fix, Fix) and earlier.fix.reason is PositionedReason.defines_world
             if isinstance(earlier.fix, Fix) and earlier.points and (is_first or isinstance(step.fix, NoFix)):
-                fix = earlier.fix.moved_to(earlier.map, self.map, earlier.points, earlier.dots, earlier.frame.rig)
+                fix = earlier.fix.moved_to(earlier.map, self.map, earlier.points, earlier.centres, earlier.frame.rig)
                 step = replace(earlier, fix=fix, map=self.map, elsewhere=None)
             yield replace(
                 step, frame=before.frame, events=before.events, timings_ms=_sum(before.timings_ms, step.timings_ms)

@@ -59,11 +59,13 @@ class Dots:
     """The dots of one image."""
 
     uv_px: Float[np.ndarray, "n 2"]
-    """Centre of the dot's ellipse (px), uncorrected for eccentricity."""
+    """Centre of the dot's ellipse (px), uncorrected for eccentricity; or among ``Step.centres`` the image of its
+    target's centre."""
     cov_px2: Float[np.ndarray, "n 2 2"]
     """Covariance of the centre (px²), before the recording's noise scale."""
     ellipse: Float[np.ndarray, "n 3"]
-    """Semi-axes a ≥ b (px) and the angle of the long one from the u axis (rad); NaN where unknown."""
+    """Semi-axes a ≥ b (px) and the angle of the long one from the u axis (rad); NaN where unknown, a = b where only the
+    size is known."""
     label: Int[np.ndarray, "n"]
     """Class of the dot (size, colour, code); -1 where it has none."""
     row: Int[np.ndarray, "n"]
@@ -516,6 +518,9 @@ class Step:
     """Milliseconds per stage."""
     elsewhere: Elsewhere | None = None
     """Where the frame stands if it is on an island."""
+    centres: StereoDots | None = None
+    """The dots, row by row, at the images of their targets' centres, with the covariances that they have there: what
+    points, poses, residuals and any adjustment rest on. ``dots`` are as they were found, at their ellipses' centres."""
 
     def remembered(self) -> "Step":
         """The same without what is large: images, hypotheses, and of the map all but the identified targets."""

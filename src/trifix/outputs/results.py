@@ -271,17 +271,17 @@ class ResultsWriter:
             return [], np.zeros(0)
         frame, ids = step.frame.index, step.map.id[fix.target]
         mm = [fixed(value) for value in fix.residual_mm]
-        if step.dots is None or step.matches is None or step.frame.rig is None:
+        if step.centres is None or step.matches is None or step.frame.rig is None:
             rows = points.row[fix.point]
             return [f"{frame},point,{r},{i},{e}," for r, i, e in zip(rows, ids, mm, strict=True)], np.zeros(0)
         rig, match = step.frame.rig, points.match[fix.point]
         in_left = fix.T_world_sensor.inverse().apply(step.map.xyz_mm[fix.target])
         left, right = step.matches.left[match], step.matches.right[match]
-        px_left = _distance_px(rig.left, in_left, step.dots.left.uv_px[left])
-        px_right = _distance_px(rig.right, rig.T_right_left.apply(in_left), step.dots.right.uv_px[right])
-        row = step.dots.left.row, step.dots.right.row
+        px_left = _distance_px(rig.left, in_left, step.centres.left.uv_px[left])
+        px_right = _distance_px(rig.right, rig.T_right_left.apply(in_left), step.centres.right.uv_px[right])
+        row = step.centres.left.row, step.centres.right.row
         if self._level == "images":  # rows of the dots.csv among the results
-            ends = self._dots_written + np.cumsum([0, len(step.dots.left), len(step.dots.right)])
+            ends = self._dots_written + np.cumsum([0, len(step.centres.left), len(step.centres.right)])
             row = np.arange(ends[0], ends[1]), np.arange(ends[1], ends[2])
         sightings = []
         for k, target in enumerate(ids):

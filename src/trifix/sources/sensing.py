@@ -30,8 +30,8 @@ class Sightings:
     """Row of the target."""
     uv_px: Float[np.ndarray, "s 2"]
     """Centre of the image of the circle, which is not the image of the centre."""
-    diameter_px: Float[np.ndarray, "s"]
-    """Diameter of the circle of the same area."""
+    root_px: Float[np.ndarray, "s 2 2"]
+    """The image's shape: the symmetric matrix that makes it of the unit circle."""
     sigma_px: Float[np.ndarray, "s"]
     """Standard deviation that the dot would have, per axis."""
 
@@ -43,8 +43,13 @@ class Sightings:
     def where(self, kept: Bool[np.ndarray, "s"]) -> "Sightings":
         """Those of a mask."""
         return Sightings(
-            self.frame[kept], self.target[kept], self.uv_px[kept], self.diameter_px[kept], self.sigma_px[kept]
+            self.frame[kept], self.target[kept], self.uv_px[kept], self.root_px[kept], self.sigma_px[kept]
         )
+
+    @property
+    def diameter_px(self) -> Float[np.ndarray, "s"]:
+        """Diameter of the circle of the same area."""
+        return np.asarray(2 * np.sqrt(np.linalg.det(self.root_px)))
 
 
 def camera_poses(scene: Scene, side: int) -> list[Pose]:
@@ -83,14 +88,14 @@ def sightings(scene: Scene, side: int) -> Sightings:
     free = ~scene.surface.hides(centre[frame], targets.xyz_mm[target])
     frame, target = frame[free], target[free]
 
-    uv, diameter, extent = _images_of_circles(
+    uv, root, extent = _images_of_circles(
         camera, R[frame], t[frame], targets.xyz_mm[target], targets.normal[target], scene.diameter_mm
     )
     size = np.array([camera.width_px, camera.height_px])
     whole = ((uv - extent > 0) & (uv + extent < size - 1)).all(axis=1)
     to_camera = centre[frame] - targets.xyz_mm[target]
     cosine = np.einsum("si,si->s", to_camera, targets.normal[target]) / np.linalg.norm(to_camera, axis=1)
-    return Sightings(frame, target, uv, diameter, sensing.sigma_px / cosine).where(whole)
+    return Sightings(frame, target, uv, root, sensing.sigma_px / cosine).where(whole)
 
 
 def dots_of_frame(
@@ -103,34 +108,59 @@ def dots_of_frame(
         rows = seen[side].of_frame(k)
         target, sigma = seen[side].target[rows], seen[side].sigma_px[rows]
         uv = seen[side].uv_px[rows] + sigma[:, None] * rng.standard_normal((len(target), 2))
-        diameter = seen[side].diameter_px[rows] + 0.5 * sigma * rng.standard_normal(len(target))
+        size, oval = rng.standard_normal(len(target)), rng.spawn(1)[0].standard_normal((len(target), 2))
+        ellipse = _ellipses(seen[side].root_px[rows] + sigma[:, None, None] * _shape_errors(size, oval))
         found = rng.random(len(target)) >= sensing.dropout
         ghosts = rng.poisson(sensing.ghosts_per_image + sensing.ghosts_per_dot * len(target))
         columns.append(
             (
                 np.full(found.sum() + ghosts, side),
                 np.concatenate([uv[found], rng.uniform(0, 1, (ghosts, 2)) * [camera.width_px, camera.height_px] - 0.5]),
-                np.concatenate([diameter[found], rng.uniform(5, 30, ghosts)]),
+                np.concatenate([ellipse[found], _ghosts(ghosts, rng)]),
                 np.concatenate([sigma[found], np.full(ghosts, sensing.sigma_px)]),
                 np.concatenate([target[found], np.full(ghosts, -1)]),
             )
         )
-    side_of, uv, diameter, sigma, label = (np.concatenate(column) for column in zip(*columns, strict=True))
+    side_of, uv, ellipse, sigma, label = (np.concatenate(column) for column in zip(*columns, strict=True))
     order = rng.permutation(len(label))
-    side_of, uv, diameter, sigma, label = side_of[order], uv[order], diameter[order], sigma[order], label[order]
+    side_of, uv, ellipse, sigma, label = side_of[order], uv[order], ellipse[order], sigma[order], label[order]
 
     def dots(side: int) -> Dots:
         row = np.nonzero(side_of == side)[0]
-        radius = 0.5 * diameter[row]
         return Dots(
             uv_px=uv[row],
             cov_px2=sigma[row, None, None] ** 2 * np.eye(2),
-            ellipse=np.stack([radius, radius, np.zeros(len(row))], axis=1),
+            ellipse=ellipse[row],
             label=np.full(len(row), -1),
             row=first_row + row,
         )
 
     return StereoDots(dots(0), dots(1)), label
+
+
+def _shape_errors(size: Float[np.ndarray, "n"], oval: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n 2 2"]:
+    """Errors of a shape whose edge errs independently all round, where those of the centre are one along each axis.
+
+    As harmonics of the angle: the centre has both of the first, the mean radius half of their variance, and the two
+    ways of being oval as much as they.
+    """
+    mean, along, across = size / np.sqrt(2), oval[:, 0], oval[:, 1]
+    return np.stack([np.stack([mean + along, across], axis=1), np.stack([across, mean - along], axis=1)], axis=1)
+
+
+def _ellipses(root_px: Float[np.ndarray, "n 2 2"]) -> Float[np.ndarray, "n 3"]:
+    """Semi-axes and angle of shapes; however small the dot, there is something of it."""
+    value, vector = np.linalg.eigh(root_px)
+    axes = np.maximum(value[:, ::-1], 0.5)
+    return np.column_stack([axes, np.arctan2(vector[:, 1, 1], vector[:, 0, 1])])
+
+
+def _ghosts(n: int, rng: np.random.Generator) -> Float[np.ndarray, "n 3"]:
+    """Shapes of dots that are no target."""
+    radius = 0.5 * rng.uniform(5, 30, n)
+    rng = rng.spawn(1)[0]
+    ratio = rng.uniform(0.4, 1.0, n)
+    return np.column_stack([radius / np.sqrt(ratio), radius * np.sqrt(ratio), rng.uniform(0, np.pi, n)])
 
 
 def points_of_frame(
@@ -198,19 +228,20 @@ def _images_of_circles(
     centre_mm: Float[np.ndarray, "n 3"],
     normal: Float[np.ndarray, "n 3"],
     diameter_mm: float,
-) -> tuple[Float[np.ndarray, "n 2"], Float[np.ndarray, "n"], Float[np.ndarray, "n 2"]]:
-    """Centre of area, diameter of equal area, and half extent along u and v (px) of circles seen by a camera.
+) -> tuple[Float[np.ndarray, "n 2"], Float[np.ndarray, "n 2 2"], Float[np.ndarray, "n 2"]]:
+    """Centre of area, shape as in ``Sightings``, and half extent along u and v (px) of circles seen by a camera.
 
-    The rim is projected point by point, so perspective and distortion are both exact; a polygon of r corners on an
-    ellipse has its centre, and r/(2π) sin(2π/r) of its area.
+    The rim is projected point by point, so perspective and distortion are both exact; the integrals are taken along the
+    smooth curve through its points. Those have half of the shape's square as their second moments.
     """
     rim = circle_rim(centre_mm, normal, diameter_mm)
     in_camera = np.einsum("nij,nrj->nri", R, rim) + t[:, None]
     uv = camera.project(in_camera.reshape(-1, 3)).reshape(len(R), _RIM, 2)
     around = uv - uv.mean(axis=1, keepdims=True)
-    after = np.roll(around, -1, axis=1)
-    cross = around[:, :, 0] * after[:, :, 1] - around[:, :, 1] * after[:, :, 0]
-    double_area = cross.sum(axis=1)
-    centre = ((around + after) * cross[:, :, None]).sum(axis=1) / (3 * double_area[:, None]) + uv.mean(axis=1)
-    area = 0.5 * np.abs(double_area) / (_RIM / (2 * np.pi) * np.sin(2 * np.pi / _RIM))
-    return np.asarray(centre), np.sqrt(4 * area / np.pi), np.asarray(np.ptp(uv, axis=1) / 2)
+    wave = 1j * np.arange(_RIM // 2 + 1)
+    ahead = np.fft.irfft(wave[:, None] * np.fft.rfft(around, axis=1), _RIM, axis=1)
+    cross = around[:, :, 0] * ahead[:, :, 1] - around[:, :, 1] * ahead[:, :, 0]
+    centre = 2 * (around * cross[:, :, None]).sum(axis=1) / (3 * cross.sum(axis=1)[:, None])
+    value, vector = np.linalg.eigh(np.einsum("nri,nrj->nij", around, around) * (2 / _RIM))
+    root = (vector * np.sqrt(value)[:, None]) @ np.swapaxes(vector, 1, 2)
+    return np.asarray(centre + uv.mean(axis=1)), np.asarray(root), np.asarray(np.ptp(uv, axis=1) / 2)

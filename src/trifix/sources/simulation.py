@@ -16,7 +16,7 @@ from jaxtyping import Int
 
 from trifix.errors import SimulationError
 from trifix.files.calibrations import write_rig
-from trifix.files.recordings import LEVELS, Level, write_frames, write_points
+from trifix.files.recordings import LEVELS, Level, write_dots, write_frames, write_points
 from trifix.files.tables import fixed, write_table
 from trifix.records import Frame, SensorPoints, StereoDots, StereoImages
 from trifix.sources.rendering import Renderer
@@ -192,24 +192,14 @@ def _whole_or_not_at_all(folder: Path) -> Iterator[Path]:
 
 
 def _write_dots(simulation: Simulation, path: Path) -> None:
-    """Centres and diameters; the noise is left for the program to find."""
+    """Centres and ellipses; the noise is left for the program to find."""
     frame = simulation.truth.label_frame
-    camera, uv, diameter = np.zeros(len(frame), dtype=np.int64), np.zeros((len(frame), 2)), np.zeros(len(frame))
+    camera, uv, ellipse = np.zeros(len(frame), dtype=np.int64), np.zeros((len(frame), 2)), np.zeros((len(frame), 3))
     for one in simulation.frames:
         if isinstance(one.content, StereoDots):
             for side, dots in enumerate((one.content.left, one.content.right)):
-                camera[dots.row], uv[dots.row], diameter[dots.row] = side, dots.uv_px, dots.diameter_px
-    write_table(
-        path,
-        {
-            "frame": [str(k) for k in frame.tolist()],
-            "timestamp_ns": [str(stamp) for stamp in simulation.truth.frames.timestamp_ns[frame].tolist()],
-            "camera": [str(side) for side in camera.tolist()],
-            "u": [fixed(x) for x in uv[:, 0].tolist()],
-            "v": [fixed(x) for x in uv[:, 1].tolist()],
-            "diameter_px": [fixed(x, 3) for x in diameter.tolist()],
-        },
-    )
+                camera[dots.row], uv[dots.row], ellipse[dots.row] = side, dots.uv_px, dots.ellipse
+    write_dots(path, frame, simulation.truth.frames.timestamp_ns[frame], camera, uv, ellipse=ellipse)
 
 
 def _write_points(simulation: Simulation, path: Path) -> None:

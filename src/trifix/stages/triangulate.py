@@ -1,16 +1,20 @@
-"""Stereo matches -> points in sensor coordinates, with their covariance (the paper's part P5). Knows no map."""
+"""Stereo matches -> points in sensor coordinates, with their covariance (the paper's part P5). Knows no map.
 
-from dataclasses import dataclass
+Before that, dots become images of the targets' centres: that is no longer where their ellipses have theirs.
+"""
+
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
 from jaxtyping import Float, Int
 
 from trifix.geometry import triangulation
-from trifix.geometry.camera import StereoRig
+from trifix.geometry.camera import Camera, StereoRig
+from trifix.geometry.eccentricity import CircleViews, share_of_answers, views_of_circles
 from trifix.kernels import floats, integers
 from trifix.kernels.stereo import prepare_dots, triangulate_pairs
-from trifix.records import SensorPoints, StereoDots, StereoMatches
+from trifix.records import Dots, SensorPoints, StereoDots, StereoMatches
 
 
 @dataclass(frozen=True, slots=True)
@@ -20,6 +24,44 @@ class TriangulateOptions:
     method: Literal["optimal", "linear", "midpoint"] = "optimal"
     """optimal: the least reprojection error, each dot weighted by its covariance; linear: the least algebraic error;
     midpoint: halfway between the rays. The covariance is that of the method."""
+    correct_eccentricity: bool = True
+    """Whether dots are moved where their ellipses say that the targets' centres are, and their covariances widened by
+    what the ellipses leave open; false takes the centres of the ellipses."""
+
+
+def correct_eccentricity(
+    dots: StereoDots, matches: StereoMatches, rig: StereoRig, noise_scale: float = 1.0
+) -> StereoDots:
+    """The same dots at the images of their targets' centres, with the covariance that they have there.
+
+    An ellipse has two answers; those that agree in both images are right. Dots of a single camera, and those whose pairs
+    agree in neither, get the mean of both, and a covariance with their spread. ``noise_scale`` multiplies the dots'
+    standard deviations, as it will afterwards: what does not grow with the noise is stated accordingly.
+    """
+    left, right = (
+        _views(own, camera, each, noise_scale)
+        for own, camera, each in (
+            (rig.left, rig.parameters[:12], dots.left),
+            (rig.right, rig.parameters[12:24], dots.right),
+        )
+    )
+    shares = share_of_answers(left, right, matches.left, matches.right, rig.T_right_left.R)
+    return StereoDots(*(
+        _shifted(each, views, share, noise_scale)
+        for each, views, share in zip((dots.left, dots.right), (left, right), shares, strict=True)
+    ))
+
+
+def _views(own: Camera, camera: Float[np.ndarray, "12"], dots: Dots, noise_scale: float) -> CircleViews:
+    """What the ellipses of one camera say of the targets."""
+    slopes = prepare_dots(floats(dots.uv_px), floats(dots.cov_px2), camera)[:, :2]
+    sigma_px = noise_scale * np.sqrt(0.5 * np.trace(dots.cov_px2, axis1=1, axis2=2))
+    return views_of_circles(own, slopes, dots.ellipse, sigma_px)
+
+
+def _shifted(dots: Dots, views: CircleViews, share: Float[np.ndarray, "n 2"], noise_scale: float) -> Dots:
+    shift_px, cov_px2 = views.settled(share)
+    return replace(dots, uv_px=dots.uv_px + shift_px, cov_px2=dots.cov_px2 + cov_px2 / noise_scale**2)
 
 
 def triangulate(
