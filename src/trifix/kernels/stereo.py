@@ -1,4 +1,4 @@
-"""Compiled loops of stereo vision: dots of two images to pairs to points, and what both cameras should see.
+"""Compiled loops of stereo vision: dots of two images to pairs to centres to points; what both cameras should see.
 
 A rig is one array of numbers, as ``StereoRig.parameters`` lays them out. Everything happens in undistorted slopes
 (x/z, y/z), and in millimetres. Knows no map and no hypothesis.
@@ -17,6 +17,10 @@ _TRUSTED = 1  # state of a target, as in ``TargetState``: above it, none is aliv
 
 # columns of a prepared dot: slopes, their covariance, and the one that an error of one pixel in u and v would make
 _X, _Y, _CXX, _CXY, _CYY, _PXX, _PXY, _PYY = range(8)
+
+# columns of the view of a circle, which has two answers: for either, the shift (px) from the ellipse's centre to the
+# image of the circle's, and the unit normal towards the camera; the errors of shift (px) and normal (rad) about an axis
+_SHIFT, _NORMAL, _SHIFT_SIGMA, _NORMAL_SIGMA = (0, 2), (4, 7), 10, 11
 
 
 # --- one camera ------------------------------------------------------------------------------------------------------
@@ -153,6 +157,175 @@ def _is_in_image(camera: CameraParameters, x: float, y: float, z: float, margin_
         return False
     x_back, y_back = _undistort(camera, x_d, y_d)
     return abs(x_back - x) < 1e-6 * (1 + abs(x)) and abs(y_back - y) < 1e-6 * (1 + abs(y))
+
+
+# --- circles, whose centres are not where their images have theirs ---------------------------------------------------
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def views_of_circles(
+    dots: Float[np.ndarray, "n 8"],
+    ellipse: Float[np.ndarray, "n 3"],
+    sigma_px: Float[np.ndarray, "n"],
+    camera: CameraParameters,
+) -> Float[np.ndarray, "n 12"]:
+    """What the ellipses of prepared dots say of the circles that they show; ``sigma_px`` are the errors of the centres.
+
+    A circle of centre X, radius r and normal N has the dual conic r² (I − N Nᵀ) − X Xᵀ, and that of the ellipse is a
+    multiple of it: one decomposition gives the two circles that it may be (Hartley & Zisserman 2004, 8.6). Where a = b,
+    only the size is taken to be known, and the shift as uncertain as circles tilted by any angle make it.
+    """
+    out = np.zeros((len(dots), 12))
+    C, V = np.empty((3, 3)), np.empty((3, 3))
+    for i in range(len(dots)):
+        out[i, 4:10], out[i, _NORMAL_SIGMA] = np.nan, np.inf
+        x, y, a_px, b_px = dots[i, _X], dots[i, _Y], ellipse[i, 0], ellipse[i, 1]
+        if not (a_px > 0 and b_px > 0 and np.isfinite(x + y + a_px + ellipse[i, 2])):
+            continue
+        a, b, d = _distort_jacobian(camera, x, y)
+        det = a * d - b * b
+        # the half axes as slopes, and how far a lens moves the centre of area: the second moments are Σ h hᵀ / 4, and
+        # over them count the mapping's curvature and where it makes area large, Σ (D J h / 8 + J h tr(J⁻¹ D J) / 4)
+        c, s = np.cos(ellipse[i, 2]), np.sin(ellipse[i, 2])
+        sxx = sxy = syy = bend_x = bend_y = 0.0
+        for k in range(2):
+            hu, hv = (a_px * c, a_px * s) if k == 0 else (-b_px * s, b_px * c)
+            hu, hv = hu / camera[0], hv / camera[1]
+            hx, hy = (d * hu - b * hv) / det, (a * hv - b * hu) / det
+            sxx, sxy, syy = sxx + hx * hx, sxy + hx * hy, syy + hy * hy
+            a1, b1, d1 = _distort_jacobian(camera, x + hx, y + hy)
+            a0, b0, d0 = _distort_jacobian(camera, x - hx, y - hy)
+            da, db, dd = 0.5 * (a1 - a0), 0.5 * (b1 - b0), 0.5 * (d1 - d0)
+            gain = (d * da - 2 * b * db + a * dd) / det
+            bend_x += (da * hx + db * hy) / 8 + hu * gain / 4
+            bend_y += (db * hx + dd * hy) / 8 + hv * gain / 4
+        largest_px = a_px * a_px / np.sqrt(camera[0] * camera[1] * det)  # a²/f: a tilt θ shifts by a²/f sin θ cos θ
+        if not a_px > b_px:
+            for k in range(2):
+                out[i, _SHIFT[k]], out[i, _SHIFT[k] + 1] = -camera[0] * bend_x, -camera[1] * bend_y
+            out[i, _SHIFT_SIGMA] = 0.25 * largest_px  # sin² θ cos² θ is 1/8 on average, and there are two axes
+            continue
+        mx, my = x - (d * bend_x - b * bend_y) / det, y - (a * bend_y - b * bend_x) / det
+        C[0, 0], C[0, 1], C[0, 2] = sxx - mx * mx, sxy - mx * my, -mx
+        C[1, 1], C[1, 2], C[2, 2] = syy - my * my, -my, -1.0
+        _diagonalise(C, V)
+        # by the largest eigenvalue, r² across N and X, the others are μ > 0 > ν, and in the plane of their vectors
+        # N = (±√(1−μ) cos α, −√(1−ν) sin α), X = (±√(1−μ) sin α, √(1−ν) cos α) in radii, sin² α = μ/(μ−ν)
+        last = 0 if C[0, 0] < 0 else 1 if C[1, 1] < 0 else 2
+        middle, first = (last + 1) % 3, (last + 2) % 3
+        if C[middle, middle] > C[first, first]:
+            middle, first = first, middle
+        mu, nu = C[middle, middle] / C[first, first], C[last, last] / C[first, first]
+        sine, cosine = np.sqrt(mu / (mu - nu)), np.sqrt(-nu / (mu - nu))
+        p, q = np.sqrt(max(1 - mu, 0.0)), np.sqrt(1 - nu)
+        ahead = q if V[2, last] > 0 else -q
+        facing = 1.0
+        for k in range(2):
+            side = p if k == 0 else -p
+            X0 = side * sine * V[0, middle] + ahead * cosine * V[0, last]
+            X1 = side * sine * V[1, middle] + ahead * cosine * V[1, last]
+            X2 = side * sine * V[2, middle] + ahead * cosine * V[2, last]
+            N0 = side * cosine * V[0, middle] - ahead * sine * V[0, last]
+            N1 = side * cosine * V[1, middle] - ahead * sine * V[1, last]
+            N2 = side * cosine * V[2, middle] - ahead * sine * V[2, last]
+            dx, dy = X0 / X2 - mx, X1 / X2 - my
+            out[i, _SHIFT[k]] = camera[0] * (a * dx + b * dy - bend_x)
+            out[i, _SHIFT[k] + 1] = camera[1] * (b * dx + d * dy - bend_y)
+            out[i, _NORMAL[k]], out[i, _NORMAL[k] + 1], out[i, _NORMAL[k] + 2] = N0, N1, N2
+            facing = -(N0 * X0 + N1 * X1 + N2 * X2) / np.sqrt(X0 * X0 + X1 * X1 + X2 * X2)
+        # An edge that errs independently all round moves the centre by σ along each axis, the mean radius by σ/√2, and
+        # makes a circle oval by σ. So errs b/a, the cosine of the tilt; errors alone make sin² about twice that error,
+        # and so much of it is not believed.
+        ratio = b_px / a_px
+        error = sigma_px[i] / a_px * np.sqrt(1.5 + ratio + 1.5 * ratio * ratio)
+        sigma_rad = error / np.sqrt(max(1 - facing * facing - 2 * error, error))
+        out[i, _NORMAL_SIGMA] = sigma_rad
+        doubled = 2 * facing * facing - 1  # the shift, a²/f sin θ cos θ, goes with cos 2θ along the tilt, cos θ across it
+        out[i, _SHIFT_SIGMA] = largest_px * sigma_rad * np.sqrt(0.5 * (doubled * doubled + facing * facing))
+    return out
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _diagonalise(C: Float[np.ndarray, "3 3"], V: Float[np.ndarray, "3 3"]) -> None:
+    """Eigenvalues of a symmetric matrix (its upper half) in place of its diagonal, eigenvectors as columns of V.
+
+    Jacobi's rotations: Golub & Van Loan 2013, algorithm 8.5.1; exact for the small eigenvalues beside a large one.
+    """
+    V[:] = 0.0
+    V[0, 0] = V[1, 1] = V[2, 2] = 1.0
+    for _ in range(12):
+        if C[0, 1] == 0.0 and C[0, 2] == 0.0 and C[1, 2] == 0.0:
+            return
+        for p, q, r in ((0, 2, 1), (1, 2, 0), (0, 1, 2)):
+            off = C[p, q]
+            if off == 0.0:
+                continue
+            tau = (C[q, q] - C[p, p]) / (2 * off)
+            t = (1.0 if tau >= 0 else -1.0) / (abs(tau) + np.sqrt(1 + tau * tau))
+            c = 1 / np.sqrt(1 + t * t)
+            s = t * c
+            C[p, p], C[q, q], C[p, q] = C[p, p] - t * off, C[q, q] + t * off, 0.0
+            pr, qr = (min(p, r), max(p, r)), (min(q, r), max(q, r))
+            C[pr], C[qr] = c * C[pr] - s * C[qr], s * C[pr] + c * C[qr]
+            for k in range(3):
+                V[k, p], V[k, q] = c * V[k, p] - s * V[k, q], s * V[k, p] + c * V[k, q]
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def weigh_answers(
+    left: Float[np.ndarray, "n 12"],
+    right: Float[np.ndarray, "m 12"],
+    rows_left: Int[np.ndarray, "p"],
+    rows_right: Int[np.ndarray, "p"],
+    rig: Rig,
+) -> tuple[Float[np.ndarray, "n 2"], Float[np.ndarray, "m 2"]]:
+    """Likelihoods of the two answers for the circles of either camera, from pairs that may show one circle.
+
+    Normals of one circle agree within their errors; those of others, or of false answers, are anywhere before the
+    camera, alike likely: a normal law over the uniform one on the half-sphere, summed over all pairs of a circle.
+    """
+    R = rig[24:33]
+    of_left, of_right = np.ones((len(left), 2)), np.ones((len(right), 2))
+    for k in range(len(rows_left)):
+        i, j = rows_left[k], rows_right[k]
+        variance = left[i, _NORMAL_SIGMA] ** 2 + right[j, _NORMAL_SIGMA] ** 2
+        if not variance < np.inf:
+            continue
+        for one in range(2):
+            n0, n1, n2 = left[i, _NORMAL[one]], left[i, _NORMAL[one] + 1], left[i, _NORMAL[one] + 2]
+            d0, d1 = R[0] * n0 + R[1] * n1 + R[2] * n2, R[3] * n0 + R[4] * n1 + R[5] * n2
+            d2 = R[6] * n0 + R[7] * n1 + R[8] * n2
+            for other in range(2):
+                e0 = d0 - right[j, _NORMAL[other]]
+                e1 = d1 - right[j, _NORMAL[other] + 1]
+                e2 = d2 - right[j, _NORMAL[other] + 2]
+                ratio = np.exp(-0.5 * (e0 * e0 + e1 * e1 + e2 * e2) / variance) / variance
+                of_left[i, one] += ratio
+                of_right[j, other] += ratio
+    return of_left, of_right
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def centres_of_circles(
+    uv: Float[np.ndarray, "n 2"],
+    cov: Float[np.ndarray, "n 2 2"],
+    views: Float[np.ndarray, "n 12"],
+    likelihood: Float[np.ndarray, "n 2"],
+    noise_scale: float,
+) -> tuple[Float[np.ndarray, "n 2"], Float[np.ndarray, "n 2 2"]]:
+    """Images of the circles' centres and their covariances, before the noise scale: mean and spread of the answers."""
+    uv, cov = uv.copy(), cov.copy()
+    for i in range(len(uv)):
+        share = likelihood[i, 0] / (likelihood[i, 0] + likelihood[i, 1])
+        u0, v0, u1, v1 = views[i, 0], views[i, 1], views[i, 2], views[i, 3]
+        uv[i, 0] += share * u0 + (1 - share) * u1
+        uv[i, 1] += share * v0 + (1 - share) * v1
+        apart, own = share * (1 - share) / noise_scale**2, (views[i, _SHIFT_SIGMA] / noise_scale) ** 2
+        cov[i, 0, 0] += apart * (u0 - u1) ** 2 + own
+        cov[i, 0, 1] += apart * (u0 - u1) * (v0 - v1)
+        cov[i, 1, 0] = cov[i, 0, 1]
+        cov[i, 1, 1] += apart * (v0 - v1) ** 2 + own
+    return uv, cov
 
 
 # --- two cameras -----------------------------------------------------------------------------------------------------
@@ -472,6 +645,9 @@ def warm_up() -> None:
     left, right = prepare_dots(uv, cov, rig[:12]), prepare_dots(uv - [0.2, 0.0], cov, rig[12:24])
     size, label = np.ones((2, 3)), np.full(2, -1)
     pairs = pair_dots(left, right, size, size, label, label, rig, 3.0, 1.0, 100.0, 1000.0, 2.0, 0.0)
+    views = [views_of_circles(each, size, np.ones(2), rig[:12]) for each in (left, right)]
+    likelihood, _ = weigh_answers(views[0], views[1], pairs[0], pairs[1], rig)
+    centres_of_circles(uv, cov, views[0], likelihood, 1.0)
     xyz, _, _ = triangulate_pairs(left, right, pairs[0], pairs[1], rig, 1.0)
     for each in (rig, np.zeros(0)):
         expected_targets(xyz, -xyz, np.zeros(len(xyz), np.int64), np.eye(3), np.zeros(3), xyz, each, 10.0)

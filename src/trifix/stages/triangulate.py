@@ -10,10 +10,9 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from trifix.geometry import triangulation
-from trifix.geometry.camera import Camera, StereoRig
-from trifix.geometry.eccentricity import CircleViews, share_of_answers, views_of_circles
+from trifix.geometry.camera import StereoRig
 from trifix.kernels import floats, integers
-from trifix.kernels.stereo import prepare_dots, triangulate_pairs
+from trifix.kernels.stereo import centres_of_circles, prepare_dots, triangulate_pairs, views_of_circles, weigh_answers
 from trifix.records import Dots, SensorPoints, StereoDots, StereoMatches
 
 
@@ -38,30 +37,29 @@ def correct_eccentricity(
     agree in neither, get the mean of both, and a covariance with their spread. ``noise_scale`` multiplies the dots'
     standard deviations, as it will afterwards: what does not grow with the noise is stated accordingly.
     """
-    left, right = (
-        _views(own, camera, each, noise_scale)
-        for own, camera, each in (
-            (rig.left, rig.parameters[:12], dots.left),
-            (rig.right, rig.parameters[12:24], dots.right),
-        )
+    parameters = rig.parameters
+    left = _views(dots.left, parameters[:12], noise_scale)
+    right = _views(dots.right, parameters[12:24], noise_scale)
+    likelihoods = weigh_answers(left, right, integers(matches.left), integers(matches.right), parameters)
+    return StereoDots(
+        _shifted(dots.left, left, likelihoods[0], noise_scale), _shifted(dots.right, right, likelihoods[1], noise_scale)
     )
-    shares = share_of_answers(left, right, matches.left, matches.right, rig.T_right_left.R)
-    return StereoDots(*(
-        _shifted(each, views, share, noise_scale)
-        for each, views, share in zip((dots.left, dots.right), (left, right), shares, strict=True)
-    ))
 
 
-def _views(own: Camera, camera: Float[np.ndarray, "12"], dots: Dots, noise_scale: float) -> CircleViews:
+def _views(dots: Dots, camera: Float[np.ndarray, "12"], noise_scale: float) -> Float[np.ndarray, "n 12"]:
     """What the ellipses of one camera say of the targets."""
-    slopes = prepare_dots(floats(dots.uv_px), floats(dots.cov_px2), camera)[:, :2]
+    prepared = prepare_dots(floats(dots.uv_px), floats(dots.cov_px2), camera)
     sigma_px = noise_scale * np.sqrt(0.5 * np.trace(dots.cov_px2, axis1=1, axis2=2))
-    return views_of_circles(own, slopes, dots.ellipse, sigma_px)
+    return np.asarray(views_of_circles(prepared, floats(dots.ellipse), sigma_px, camera))
 
 
-def _shifted(dots: Dots, views: CircleViews, share: Float[np.ndarray, "n 2"], noise_scale: float) -> Dots:
-    shift_px, cov_px2 = views.settled(share)
-    return replace(dots, uv_px=dots.uv_px + shift_px, cov_px2=dots.cov_px2 + cov_px2 / noise_scale**2)
+def _shifted(
+    dots: Dots, views: Float[np.ndarray, "n 12"], likelihood: Float[np.ndarray, "n 2"], noise_scale: float
+) -> Dots:
+    uv, cov = centres_of_circles(
+        floats(dots.uv_px), floats(dots.cov_px2), views, likelihood, float(noise_scale)
+    )
+    return replace(dots, uv_px=uv, cov_px2=cov)
 
 
 def triangulate(
