@@ -240,7 +240,9 @@ def views_of_circles(
         error = sigma_px[i] / a_px * np.sqrt(1.5 + ratio + 1.5 * ratio * ratio)
         sigma_rad = error / np.sqrt(max(1 - facing * facing - 2 * error, error))
         out[i, _NORMAL_SIGMA] = sigma_rad
-        doubled = 2 * facing * facing - 1  # the shift, a²/f sin θ cos θ, goes with cos 2θ along the tilt, cos θ across it
+        doubled = (
+            2 * facing * facing - 1
+        )  # the shift, a²/f sin θ cos θ, goes with cos 2θ along the tilt, cos θ across it
         out[i, _SHIFT_SIGMA] = largest_px * sigma_rad * np.sqrt(0.5 * (doubled * doubled + facing * facing))
     return out
 

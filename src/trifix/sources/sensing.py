@@ -42,9 +42,7 @@ class Sightings:
 
     def where(self, kept: Bool[np.ndarray, "s"]) -> "Sightings":
         """Those of a mask."""
-        return Sightings(
-            self.frame[kept], self.target[kept], self.uv_px[kept], self.root_px[kept], self.sigma_px[kept]
-        )
+        return Sightings(self.frame[kept], self.target[kept], self.uv_px[kept], self.root_px[kept], self.sigma_px[kept])
 
     @property
     def diameter_px(self) -> Float[np.ndarray, "s"]:

@@ -17,7 +17,7 @@ from jaxtyping import Int
 from trifix.errors import SimulationError
 from trifix.files.calibrations import write_rig
 from trifix.files.recordings import LEVELS, Level, write_dots, write_frames, write_points
-from trifix.files.tables import fixed, write_table
+from trifix.files.tables import write_table
 from trifix.records import Frame, SensorPoints, StereoDots, StereoImages
 from trifix.sources.rendering import Renderer
 from trifix.sources.scenes import SCENES, Scene, recipe_of

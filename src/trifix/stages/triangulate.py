@@ -33,9 +33,9 @@ def correct_eccentricity(
 ) -> StereoDots:
     """The same dots at the images of their targets' centres, with the covariance that they have there.
 
-    An ellipse has two answers; those that agree in both images are right. Dots of a single camera, and those whose pairs
-    agree in neither, get the mean of both, and a covariance with their spread. ``noise_scale`` multiplies the dots'
-    standard deviations, as it will afterwards: what does not grow with the noise is stated accordingly.
+    An ellipse has two answers; those that agree in both images are right. Dots of a single camera, and those whose
+    pairs agree in neither, get the mean of both, and a covariance with their spread. ``noise_scale`` multiplies the
+    dots' standard deviations, as it will afterwards: what does not grow with the noise is stated accordingly.
     """
     parameters = rig.parameters
     left = _views(dots.left, parameters[:12], noise_scale)
@@ -56,9 +56,7 @@ def _views(dots: Dots, camera: Float[np.ndarray, "12"], noise_scale: float) -> F
 def _shifted(
     dots: Dots, views: Float[np.ndarray, "n 12"], likelihood: Float[np.ndarray, "n 2"], noise_scale: float
 ) -> Dots:
-    uv, cov = centres_of_circles(
-        floats(dots.uv_px), floats(dots.cov_px2), views, likelihood, float(noise_scale)
-    )
+    uv, cov = centres_of_circles(floats(dots.uv_px), floats(dots.cov_px2), views, likelihood, float(noise_scale))
     return replace(dots, uv_px=uv, cov_px2=cov)
 
 
