@@ -31,6 +31,7 @@ _MODULE_OF = {
     "StereoMatches": "trifix.records",
     "StereoRig": "trifix.geometry.camera",
     "TrifixError": "trifix.errors",
+    "correct_eccentricity": "trifix.stages.triangulate",
     "detect": "trifix.stages.detect",
     "evaluate": "trifix.evaluation",
     "identifier": "trifix.stages.identify",

@@ -26,7 +26,7 @@ from trifix.stages.detect import detect
 from trifix.stages.identify import identifier
 from trifix.stages.match import match
 from trifix.stages.orient import orient
-from trifix.stages.triangulate import triangulate
+from trifix.stages.triangulate import correct_eccentricity, triangulate
 from trifix.stages.update import update
 from trifix.stages.verify import verify
 
@@ -52,6 +52,7 @@ __all__ = [
     "StereoMatches",
     "StereoRig",
     "TrifixError",
+    "correct_eccentricity",
     "detect",
     "evaluate",
     "identifier",

@@ -34,7 +34,7 @@ from trifix.records import (
     StereoMatches,
     TargetState,
 )
-from trifix.stages.triangulate import triangulate
+from trifix.stages.triangulate import correct_eccentricity, triangulate
 
 SIGMAS = 5.0
 """A wrong pose that is nearer than this to the pose of the true labels is drift, not misidentification."""
@@ -588,11 +588,13 @@ def _once_each(points: SensorPoints, label: Int[np.ndarray, "n"]) -> _Labelled:
 def _triangulated(
     dots: StereoDots, rig: StereoRig, label_left: Int[np.ndarray, "l"], label_right: Int[np.ndarray, "r"]
 ) -> _Labelled:
-    """The targets that both cameras saw."""
+    """The targets that both cameras saw, where their ellipses say that their centres are."""
     ids, left, right = np.intersect1d(label_left, label_right, return_indices=True)
     left, right = left[ids >= 0], right[ids >= 0]
     unused = np.zeros(len(left))
-    points = triangulate(dots, StereoMatches(left, right, unused, unused), rig)
+    matches = StereoMatches(left, right, unused, unused)
+    dots = correct_eccentricity(dots, matches, rig)
+    points = triangulate(dots, matches, rig)
     single = [
         (np.full(len(own), camera), own, seen.uv_px[row], seen.cov_px2[row])
         for camera, (seen, label, other) in enumerate(
@@ -616,9 +618,14 @@ def _unshared(
 
 def _detected(file: Path, source: Recording) -> list[tuple[int, StereoRig | None, StereoDots]]:
     """The dots that the run itself found in the images, with the rig of each frame."""
-    table = read_table(file, {"frame": int, "camera": int, "u": float, "v": float, "sigma_px": float})
-    dots = Dots.of(np.stack([table["u"], table["v"]], axis=1))
-    dots = replace(dots, cov_px2=table["sigma_px"][:, None, None] ** 2 * np.eye(2))
+    shape = ("a_px", "b_px", "theta_rad")
+    numbers = dict.fromkeys(("u", "v", "sigma_px", *shape), float)
+    table = read_table(file, {"frame": int, "camera": int, **numbers})
+    dots = replace(
+        Dots.of(np.stack([table["u"], table["v"]], axis=1)),
+        cov_px2=table["sigma_px"][:, None, None] ** 2 * np.eye(2),
+        ellipse=np.stack([table[name] for name in shape], axis=1),
+    )
 
     image = 2 * np.searchsorted(source.index, table["frame"]) + table["camera"]
     order = np.argsort(image, kind="stable")
