@@ -619,12 +619,13 @@ def _unshared(
 def _detected(file: Path, source: Recording) -> list[tuple[int, StereoRig | None, StereoDots]]:
     """The dots that the run itself found in the images, with the rig of each frame."""
     shape = ("a_px", "b_px", "theta_rad")
-    numbers = dict.fromkeys(("u", "v", "sigma_px", *shape), float)
-    table = read_table(file, {"frame": int, "camera": int, **numbers})
+    numbers = dict.fromkeys(("u", "v", "sigma_px"), float)
+    table = read_table(file, {"frame": int, "camera": int, **numbers}, dict.fromkeys(shape, float))
+    unknown = np.full(len(table["u"]), np.nan)
     dots = replace(
         Dots.of(np.stack([table["u"], table["v"]], axis=1)),
         cov_px2=table["sigma_px"][:, None, None] ** 2 * np.eye(2),
-        ellipse=np.stack([table[name] for name in shape], axis=1),
+        ellipse=np.stack([table.get(name, unknown) for name in shape], axis=1),
     )
 
     image = 2 * np.searchsorted(source.index, table["frame"]) + table["camera"]

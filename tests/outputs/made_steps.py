@@ -115,7 +115,7 @@ def step(k: int, level: str, rng: np.random.Generator, world: ReferenceMap) -> S
     none = np.zeros(0, dtype=np.int64)
     return Step(
         frame, dots, matched, points, Identification(known[None], visible[known][None]), fix, none, world, 1.1, events,
-        timings,
+        timings, centres=dots,
     )  # fmt: skip
 
 

@@ -21,6 +21,7 @@ _X, _Y, _CXX, _CXY, _CYY, _PXX, _PXY, _PYY = range(8)
 # columns of the view of a circle, which has two answers: for either, the shift (px) from the ellipse's centre to the
 # image of the circle's, and the unit normal towards the camera; the errors of shift (px) and normal (rad) about an axis
 _SHIFT, _NORMAL, _SHIFT_SIGMA, _NORMAL_SIGMA = (0, 2), (4, 7), 10, 11
+_OUT_OF_ROUND = 0.01  # error of b/a that no noise explains: targets as they are printed, pixels as they are calibrated
 
 
 # --- one camera ------------------------------------------------------------------------------------------------------
@@ -237,7 +238,7 @@ def views_of_circles(
         # makes a circle oval by σ. So errs b/a, the cosine of the tilt; errors alone make sin² about twice that error,
         # and so much of it is not believed.
         ratio = b_px / a_px
-        error = sigma_px[i] / a_px * np.sqrt(1.5 + ratio + 1.5 * ratio * ratio)
+        error = np.hypot(sigma_px[i] / a_px * np.sqrt(1.5 + ratio + 1.5 * ratio * ratio), _OUT_OF_ROUND)
         sigma_rad = error / np.sqrt(max(1 - facing * facing - 2 * error, error))
         out[i, _NORMAL_SIGMA] = sigma_rad
         doubled = (
