@@ -1,4 +1,5 @@
 import base64
+import json
 import re
 from html.parser import HTMLParser
 from pathlib import Path
@@ -76,6 +77,31 @@ def test_the_page_says_what_came_of_the_run_and_why(text: str):
         assert why.value in words
     assert "match.max_depth_mm 900.0" in words
     assert "did not reach its end" not in words
+
+
+def test_the_page_says_what_would_help_and_marks_the_places(text: str):
+    words = " ".join(" ".join(Page(text).words).split())
+    assert "What would help" in words
+    assert re.search(r"\d+ % of the frames saw too few known targets to be sure", words)
+    numbers = re.search(r'<script type="application/json">(.*?)</script>', text, flags=re.DOTALL)
+    assert numbers is not None
+    record = json.loads(numbers[1])
+    assert len(record["advice"]) >= 1
+    assert all(len(each["xyz"]) == 3 for each in record["advice"])
+    assert "where something would help" in words
+
+
+def test_only_a_finished_run_gives_advice():
+    tally = Tally("plate", "dots", "", is_online=True)
+    made = list(steps(62))
+    for step in made:
+        tally.add(step, np.zeros(0))
+    assert tally.summary(made[-1].map, 2.0, finished=False).advice == ()
+    advice = tally.summary(made[-1].map, 2.0, finished=True).advice
+    few = next(tip for tip in advice if "too few known targets" in tip.sentence)
+    assert few.sentence.startswith(f"{round(100 * 8 / 62)} % of the frames")
+    assert few.place_mm is not None
+    assert np.abs(few.place_mm).max() < 1000
 
 
 def test_the_figures_take_their_colours_from_the_theme(text: str):
@@ -198,7 +224,7 @@ def test_the_terminal_names_what_matters():
     for step in made:
         tally.add(step, np.full(4, 0.25))
     summary: Summary = tally.summary(made[-1].map, 3.0, finished=True)
-    console = Console(width=100)
+    console = Console(width=160)
     with console.capture() as capture:
         console.print(summary_table(summary, Path("out") / "report.html"))
     said = capture.get()
@@ -209,5 +235,6 @@ def test_the_terminal_names_what_matters():
         "15.0 frames/s",
         "report.html",
         "1.10",
+        summary.advice[0].sentence.split(":")[0],
     ):
         assert words in said

@@ -386,7 +386,7 @@ def write_comparison(comparison: Comparison, first: Run, second: Run, path: Path
                 {
                     "path": run.path,
                     "is_finished": run.summary.finished,
-                    "space": space_of(run.course, run.map, None, run.identified),
+                    "space": space_of(run.course, run.map, None, run.identified, run.summary.advice),
                     "time_figure": time_figure(run.course) if len(run.course.frame) else "",
                     "path_figure": path_figure(run.course, run.map) if len(run.course.frame) else "",
                 }

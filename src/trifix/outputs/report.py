@@ -76,7 +76,7 @@ class Report:
             written=datetime.now().astimezone(),
             time_figure=time_figure(course) if len(course.frame) else "",
             path_figure=path_figure(course, self._map) if len(course.frame) else "",
-            space=space_of(course, self._map, self._rig, self._identified),
+            space=space_of(course, self._map, self._rig, self._identified, summary.advice),
             samples=samples,
             kinds=[kind for kind in KINDS if kind in drawn],
             sentences={each.name: each.value for each in (*PositionedReason, *Reason)},

@@ -188,6 +188,24 @@ function space(section) {
     }
   }
 
+  function place(tip) { // where something would help
+    const s = project(tip.xyz), r = 8;
+    if (!s) return;
+    pen.beginPath();
+    for (const [x, y] of [[0, -r], [r, 0], [0, r], [-r, 0]]) pen.lineTo(s[0] + x, s[1] + y);
+    pen.closePath();
+    pen.fillStyle = colours.mark;
+    pen.fill();
+    pen.lineWidth = 1.5;
+    pen.strokeStyle = colours.card;
+    pen.stroke();
+    pen.font = "600 10px system-ui, sans-serif";
+    pen.textAlign = "center";
+    pen.fillStyle = "#fff";
+    pen.fillText(tip.number, s[0], s[1] + 3.5);
+    pen.textAlign = "start";
+  }
+
   function label(k, words) {
     const s = project(at(path.xyz, k));
     if (!s) return;
@@ -235,6 +253,7 @@ function space(section) {
       if (chosen) label(0, "first");
       label(chosen, "frame " + path.frame[chosen]);
     }
+    data.advice.forEach(place);
     if (hovered && hovered.pose !== undefined) {
       const s = project(at(path.xyz, hovered.pose));
       if (s) {

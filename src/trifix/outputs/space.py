@@ -10,6 +10,7 @@ from jaxtyping import Bool, Float, Int
 from trifix.geometry.camera import Camera, StereoRig
 from trifix.geometry.pose import Pose
 from trifix.outputs.course import Course, object_axes
+from trifix.outputs.summary import Tip
 from trifix.records import ReferenceMap, TargetState
 
 _MOST_POSES = 1500
@@ -25,16 +26,23 @@ class Space:
 
     worst: float
     """The residual at the end of the colours (mm)."""
+    has_advice: bool
+    """Whether places are marked where something would help."""
     json: str
     """All numbers, as ``space.js`` expects them."""
 
 
 def space_of(
-    course: Course, targets: ReferenceMap, rig: StereoRig | None, identified: Sequence[Int[np.ndarray, "_"]]
+    course: Course,
+    targets: ReferenceMap,
+    rig: StereoRig | None,
+    identified: Sequence[Int[np.ndarray, "_"]],
+    advice: Sequence[Tip] = (),
 ) -> Space | None:
     """A run to be drawn, its poses thinned out; None where there is nothing to show.
 
-    Of each frame, ``identified`` holds the identities of the targets that it shows.
+    Of each frame, ``identified`` holds the identities of the targets that it shows. Places of the advice are marked,
+    numbered from 1.
     """
     shown = targets.rows(np.flatnonzero(targets.state != TargetState.removed))
     is_found = course.is_positioned
@@ -53,6 +61,9 @@ def space_of(
         "cameras": [_pyramid(Pose.identity(), None)] if rig is None else [
             _pyramid(Pose.identity(), rig.left), _pyramid(rig.T_right_left.inverse(), rig.right)
         ],
+        "advice": [
+            {"number": k, "xyz": tip.place_mm} for k, tip in enumerate(advice, start=1) if tip.place_mm is not None
+        ],
         "targets": {
             "id": shown.id.tolist(),
             "xyz": _rounded(shown.xyz_mm, 2),
@@ -70,7 +81,7 @@ def space_of(
             "targets": seen,
         },
     }  # fmt: skip
-    return Space(worst, msgspec.json.encode(record).decode())
+    return Space(worst, bool(record["advice"]), msgspec.json.encode(record).decode())
 
 
 def _thinned(is_found: Bool[np.ndarray, "n"]) -> tuple[Int[np.ndarray, "p"], Bool[np.ndarray, "p"]]:

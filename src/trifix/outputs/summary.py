@@ -10,10 +10,13 @@ from importlib.metadata import version
 import numpy as np
 from jaxtyping import Float
 
+from trifix.geometry.pose import Pose
+from trifix.outputs.advice import advice_for_run
 from trifix.records import Fix, NoFix, ReferenceMap, Step, TargetState
 
 STAGES = ("detect", "match", "triangulate", "identify", "orient", "verify", "update")
 """What is timed, in the order of the work."""
+_NOWHERE = (float("nan"),) * 12  # translation and rotation of a frame without a pose
 
 
 @dataclass(frozen=True, slots=True)
@@ -40,6 +43,16 @@ class Timing:
     """99th percentile (ms)."""
     frames: int
     """Frames in which it ran."""
+
+
+@dataclass(frozen=True, slots=True)
+class Tip:
+    """What would help the next run over the same object."""
+
+    sentence: str
+    """What to do."""
+    place_mm: tuple[float, float, float] | None
+    """Where, world coordinates (mm); None where no place is meant."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -82,6 +95,8 @@ class Summary:
     """All options used."""
     versions: dict[str, str]
     """Of trifix and of what its numbers depend on."""
+    advice: tuple[Tip, ...] = ()
+    """What the refusals of a finished run suggest, the most rewarding first."""
 
 
 class Tally:
@@ -91,7 +106,8 @@ class Tally:
         self._recording, self._level, self._is_online = recording, level, is_online
         self._options: dict[str, object] = tomllib.loads(config_toml)
         self._frames = self._positioned = 0
-        self._reasons: Counter[str] = Counter()
+        self._reason: list[str] = []
+        self._points, self._pose = array("q"), array("d")
         self._mm, self._px = _Spread(), _Spread()
         self._timings_ms = {name: array("d") for name in (*STAGES, "total")}
         self._noise_scale = 1.0
@@ -99,15 +115,17 @@ class Tally:
     def add(self, step: Step, residual_px: Float[np.ndarray, "d"]) -> None:
         """Count one frame, with the distances of its identified dots from their reprojected targets (px)."""
         self._frames += 1
+        self._points.append(0 if step.points is None else len(step.points))
         match step.fix:
             case Fix() as fix:
                 self._positioned += 1
-                if fix.reason is not None:
-                    self._reasons[fix.reason.name] += 1
+                self._reason.append("" if fix.reason is None else fix.reason.name)
+                self._pose.extend((*fix.T_world_sensor.t_mm, *fix.T_world_sensor.R.ravel()))
                 self._mm.add(fix.residual_mm)
                 self._px.add(residual_px)
             case NoFix() as refusal:
-                self._reasons[refusal.why.name] += 1
+                self._reason.append(refusal.why.name)
+                self._pose.extend(_NOWHERE)
         for stage, ms in (*step.timings_ms.items(), ("total", sum(step.timings_ms.values()))):
             self._timings_ms[stage].append(ms)
         self._noise_scale = step.noise_scale
@@ -122,7 +140,7 @@ class Tally:
             frames=self._frames,
             positioned=self._positioned,
             refused=self._frames - self._positioned,
-            reasons=dict(self._reasons.most_common()),
+            reasons=dict(Counter(filter(None, self._reason)).most_common()),
             targets={
                 state.name: int((targets.state == state).sum())
                 for state in (TargetState.trusted, TargetState.provisional, TargetState.quarantined)
@@ -140,7 +158,19 @@ class Tally:
             frames_per_s=self._frames / seconds if seconds > 0 else 0.0,
             options=self._options,
             versions=versions(),
+            advice=self._advice(targets) if finished else (),
         )
+
+    def _advice(self, targets: ReferenceMap) -> tuple[Tip, ...]:
+        rows = np.array(self._pose).reshape(-1, len(_NOWHERE))
+        poses = [None if np.isnan(row[0]) else Pose(row[3:].reshape(3, 3), row[:3]) for row in rows]
+        told = advice_for_run(self._reason, np.array(self._points, dtype=np.int64), poses, targets)
+        return tuple(Tip(each.sentence, None if each.place_mm is None else _rounded(each.place_mm)) for each in told)
+
+
+def _rounded(place_mm: Float[np.ndarray, "3"]) -> tuple[float, float, float]:
+    x, y, z = (round(float(each), 1) for each in place_mm)
+    return x, y, z
 
 
 class _Spread:

@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from rich.console import Group
+from rich.console import Group, RenderableType
 from rich.table import Table
 from rich.text import Text
 
@@ -32,4 +32,8 @@ def summary_table(summary: Summary, report: Path) -> Group:
         table.add_row("time a frame", f"{total.median_ms:.1f}", f"ms  99 % below {total.p99_ms:.1f}")
     table.add_row("in all", f"{summary.seconds:.1f}", f"s  {summary.frames_per_s:.1f} frames/s")
     warning = [Text(), Text(summary.rig, "bold yellow")] if summary.rig else []
-    return Group(table, *warning, Text(), Text.assemble("report  ", (str(report), "bold")))
+    advice = Table.grid(padding=(0, 2))
+    for tip in summary.advice:
+        advice.add_row(Text("→", "bold"), Text(tip.sentence))
+    told: list[RenderableType] = [Text(), advice] if summary.advice else []
+    return Group(table, *warning, *told, Text(), Text.assemble("report  ", (str(report), "bold")))
