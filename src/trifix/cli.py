@@ -12,9 +12,10 @@ import shlex
 import signal
 import stat
 import sys
+import threading
 import tomllib
 from collections.abc import Callable, Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Annotated, Literal
@@ -275,6 +276,38 @@ def compare(
     if page is not None:
         write_comparison(found, *runs, page)
     answer({**asdict(found), "page": page}, json, lambda: comparison_table(found))
+
+
+@app.command(sort_key=3)
+def view(
+    results: Path,
+    /,
+    *,
+    recording: Path | None = None,
+    host: str = "127.0.0.1",
+    port: int = 8080,
+    json: Json = False,
+) -> None:
+    """Go through a finished run in the browser: frame by frame, its refusals, its targets' sightings.
+
+    Args:
+        results: Folder that `trifix run` wrote.
+        recording: Folder of the recording, for its images; without it, one of the right name beside the results.
+        host: Address to listen on; at the default, only this machine sees the page.
+        port: Port to listen on; 0 is any that is free.
+    """
+    from trifix.outputs.viewer import open_run, who_can_see
+
+    viewer, run = open_run(results, recording, host, port)
+    if warning := who_can_see(host):
+        print(f"trifix: {warning}", file=sys.stderr)
+    if not run.is_finished:
+        print(f"trifix: the run in {results} did not reach its end; what it left is shown.", file=sys.stderr)
+    answer({"url": viewer.url, "finished": run.is_finished}, json, lambda: f"{viewer.url}  (ctrl-C ends it)")
+    sys.stdout.flush()
+    with suppress(KeyboardInterrupt):
+        threading.Event().wait()
+    viewer.close()
 
 
 experiment = App(name="experiment", help="Repeat the paper's experiments on simulated recordings.", sort_key=4)

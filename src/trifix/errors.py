@@ -28,3 +28,7 @@ class SimulationError(TrifixError):
 
 class AdjustmentError(TrifixError):
     """Observations that do not determine what is to be adjusted."""
+
+
+class ViewerError(TrifixError):
+    """A page that cannot be shown: what it needs is missing, or its port is taken."""

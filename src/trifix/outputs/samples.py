@@ -121,7 +121,9 @@ def _pictures(step: Step) -> tuple[Picture, ...]:
     """Left and right, or the points on one canvas."""
     dots, content, rig = step.dots, step.frame.content, step.frame.rig
     if dots is None:
-        return () if step.points is None else (_picture_of_points(step.points, step.fix),)
+        if step.points is None:
+            return ()
+        return (Picture(WIDTH_PX, HEIGHT_PX, None, points_by_kind(step.points, step.fix)),)
     assert rig is not None, "dots come with the rig that saw them"
     left_image, right_image = (content.left, content.right) if isinstance(content, StereoImages) else (None, None)
     match, point = step.matches, step.points
@@ -137,18 +139,25 @@ def _pictures(step: Step) -> tuple[Picture, ...]:
 def _picture(
     dots: Dots, dot_of_point: Int[np.ndarray, "n"], fix: Fix | NoFix, image: GreyOrColour | None, camera: Camera
 ) -> Picture:
-    kind = np.full(len(dots), "single", dtype=object)
-    kind[dot_of_point] = "unidentified" if isinstance(fix, Fix) else "refused"
-    if isinstance(fix, Fix):
-        kind[dot_of_point[fix.point]] = "identified"
-    by_kind = {each: dots.uv_px[kind == each] for each in KINDS}
+    by_kind = dots_by_kind(dots, dot_of_point, fix)
     if image is not None:
         return Picture(image.shape[1], image.shape[0], _jpeg(image), by_kind)
     return Picture(camera.width_px, camera.height_px, None, by_kind)
 
 
-def _picture_of_points(points: SensorPoints, fix: Fix | NoFix) -> Picture:
-    """The points as a pinhole at the sensor's origin would see them, filling the canvas."""
+def dots_by_kind(
+    dots: Dots, dot_of_point: Int[np.ndarray, "n"], fix: Fix | NoFix
+) -> dict[str, Float[np.ndarray, "m 2"]]:
+    """Centres of the dots of each of ``KINDS`` (px)."""
+    kind = np.full(len(dots), "single", dtype=object)
+    kind[dot_of_point] = "unidentified" if isinstance(fix, Fix) else "refused"
+    if isinstance(fix, Fix):
+        kind[dot_of_point[fix.point]] = "identified"
+    return {each: dots.uv_px[kind == each] for each in KINDS}
+
+
+def points_by_kind(points: SensorPoints, fix: Fix | NoFix) -> dict[str, Float[np.ndarray, "m 2"]]:
+    """The points of each of ``KINDS`` as a pinhole at the sensor's origin would see them, filling the canvas (px)."""
     kind = np.full(len(points), "unidentified" if isinstance(fix, Fix) else "refused", dtype=object)
     if isinstance(fix, Fix):
         kind[fix.point] = "identified"
@@ -158,7 +167,7 @@ def _picture_of_points(points: SensorPoints, fix: Fix | NoFix) -> Picture:
         low, high = xy.min(axis=0), xy.max(axis=0)
         canvas = np.array([WIDTH_PX, HEIGHT_PX])
         xy = (xy - (low + high) / 2) * (0.9 * canvas / np.maximum(high - low, 1e-6)).min() + canvas / 2
-    return Picture(WIDTH_PX, HEIGHT_PX, None, {each: xy[kind[ahead] == each] for each in KINDS})
+    return {each: xy[kind[ahead] == each] for each in KINDS}
 
 
 def _jpeg(image: GreyOrColour) -> str:
