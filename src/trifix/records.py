@@ -520,7 +520,8 @@ class Step:
     """Where the frame stands if it is on an island."""
     centres: StereoDots | None = None
     """The dots, row by row, at the images of their targets' centres, with the covariances that they have there: what
-    points, poses, residuals and any adjustment rest on. ``dots`` are as they were found, at their ellipses' centres."""
+    points, poses, residuals and any adjustment rest on. ``dots`` are as they were found, at their ellipses' centres.
+    Where ``matches`` has no row for a dot, its centre is the mean of two answers, and their spread no chance error."""
 
     def remembered(self) -> "Step":
         """The same without what is large: images, hypotheses, and of the map all but the identified targets."""
