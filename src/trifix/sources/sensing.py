@@ -4,7 +4,7 @@ Positions come from geometry alone (``Camera.project``, ray casting); chance ent
 Nothing here is shared with the stages that the simulator is there to test.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -30,6 +30,8 @@ class Sightings:
     """Row of the target."""
     uv_px: Float[np.ndarray, "s 2"]
     """Centre of the image of the circle, which is not the image of the centre."""
+    shift_px: Float[np.ndarray, "s 2"]
+    """From there to the image of the centre."""
     root_px: Float[np.ndarray, "s 2 2"]
     """The image's shape: the symmetric matrix that makes it of the unit circle."""
     sigma_px: Float[np.ndarray, "s"]
@@ -42,7 +44,7 @@ class Sightings:
 
     def where(self, kept: Bool[np.ndarray, "s"]) -> "Sightings":
         """Those of a mask."""
-        return Sightings(self.frame[kept], self.target[kept], self.uv_px[kept], self.root_px[kept], self.sigma_px[kept])
+        return Sightings(*(getattr(self, each.name)[kept] for each in fields(self)))
 
     @property
     def diameter_px(self) -> Float[np.ndarray, "s"]:
@@ -93,7 +95,8 @@ def sightings(scene: Scene, side: int) -> Sightings:
     whole = ((uv - extent > 0) & (uv + extent < size - 1)).all(axis=1)
     to_camera = centre[frame] - targets.xyz_mm[target]
     cosine = np.einsum("si,si->s", to_camera, targets.normal[target]) / np.linalg.norm(to_camera, axis=1)
-    return Sightings(frame, target, uv, root, sensing.sigma_px / cosine).where(whole)
+    centres = camera.project(np.einsum("sij,sj->si", R[frame], targets.xyz_mm[target]) + t[frame])
+    return Sightings(frame, target, uv, centres - uv, root, sensing.sigma_px / cosine).where(whole)
 
 
 def dots_of_frame(
@@ -159,6 +162,24 @@ def _ghosts(n: int, rng: np.random.Generator) -> Float[np.ndarray, "n 3"]:
     rng = rng.spawn(1)[0]
     ratio = rng.uniform(0.4, 1.0, n)
     return np.column_stack([radius / np.sqrt(ratio), radius * np.sqrt(ratio), rng.uniform(0, np.pi, n)])
+
+
+def with_centres(
+    dots: StereoDots,
+    labels: tuple[Int[np.ndarray, "l"], Int[np.ndarray, "r"]],
+    seen: tuple[Sightings, Sightings],
+    k: int,
+) -> StereoDots:
+    """The dots of frame k with the images of the targets' centres, as a sensor has them that delivers points."""
+
+    def moved(own: Dots, label: Int[np.ndarray, "d"], by: Sightings) -> Dots:
+        rows = by.of_frame(k)
+        shift_px = np.zeros((1 + label.max(initial=-1) + 1, 2))  # the last row: ghosts
+        known = by.target[rows] < len(shift_px) - 1
+        shift_px[by.target[rows][known]] = by.shift_px[rows][known]
+        return replace(own, uv_px=own.uv_px + shift_px[label])
+
+    return StereoDots(moved(dots.left, labels[0], seen[0]), moved(dots.right, labels[1], seen[1]))
 
 
 def points_of_frame(

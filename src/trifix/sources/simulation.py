@@ -21,7 +21,7 @@ from trifix.files.tables import write_table
 from trifix.records import Frame, SensorPoints, StereoDots, StereoImages
 from trifix.sources.rendering import Renderer
 from trifix.sources.scenes import SCENES, Scene, recipe_of
-from trifix.sources.sensing import Sightings, dots_of_frame, points_of_frame, sightings
+from trifix.sources.sensing import Sightings, dots_of_frame, points_of_frame, sightings, with_centres
 from trifix.sources.truth import SimulatedTruth, matrix_of, truth_of, write_truth
 
 __all__ = ["SCENES", "Simulation", "simulate", "simulate_frames"]
@@ -101,7 +101,8 @@ def _sensed(
         found[1, index, right[right >= 0]] = True
         content: StereoDots | SensorPoints = dots
         if level == "points":
-            content, label = points_of_frame(scene.rig, scene.sensing, dots, left, right, rng, rows)
+            centred = with_centres(dots, (left, right), seen, index)
+            content, label = points_of_frame(scene.rig, scene.sensing, centred, left, right, rng, rows)
             both[index, label[label >= 0]] = True
         rows += len(label)
         labels.append(label)
