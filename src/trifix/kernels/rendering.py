@@ -121,6 +121,48 @@ def shade(
 
 
 @njit(cache=True, nogil=True)
+def _slope(slopes: Float[np.ndarray, "gh gw 2"], gu: float, gv: float) -> tuple[float, float]:
+    """The undistorted slopes at a place between the nodes of a grid."""
+    i, j = int(gu), int(gv)
+    s, t = gu - i, gv - j
+    w00, w01, w10, w11 = (1 - s) * (1 - t), s * (1 - t), (1 - s) * t, s * t
+    x = slopes[j, i, 0] * w00 + slopes[j, i + 1, 0] * w01 + slopes[j + 1, i, 0] * w10 + slopes[j + 1, i + 1, 0] * w11
+    y = slopes[j, i, 1] * w00 + slopes[j, i + 1, 1] * w01 + slopes[j + 1, i, 1] * w10 + slopes[j + 1, i + 1, 1] * w11
+    return x, y
+
+
+@njit(cache=True, nogil=True)
+def _covered(q: Float[np.ndarray, "4 4"], distance: Float[np.ndarray, "4"], radius: float, lines: int) -> float:
+    """Share of a pixel in which |q| < radius · m; of its corners: (q, m) and |q|/m.
+
+    The pixel is cut into parallel lines that cross the edge rather than run along it. Along a line, q and m are linear:
+    the part inside comes from the roots of a quadratic.
+    """
+    low, high = distance.min(), distance.max()
+    if high < radius:
+        return 1.0
+    if 2 * low - high > radius:
+        return 0.0
+    across_u, across_v = distance[1] + distance[3], distance[2] + distance[3]
+    total = distance[0] + distance[1] + distance[2] + distance[3]
+    one, other = (2, 1) if abs(2 * across_u - total) > abs(2 * across_v - total) else (1, 2)
+    inside = 0.0
+    for i in range(lines):
+        t = (i + 0.5) / lines
+        a, b, c = 0.0, 0.0, 0.0  # a s² + 2 b s + c < 0
+        for j in range(4):
+            begin = q[0, j] + t * (q[one, j] - q[0, j])
+            step = q[other, j] + t * (q[3, j] - q[other, j]) - begin
+            sign = 1.0 if j < 3 else -radius * radius
+            a, b, c = a + sign * step * step, b + sign * begin * step, c + sign * begin * begin
+        root2 = b * b - a * c
+        if root2 > 0 and a > 0:
+            root = np.sqrt(root2)
+            inside += max(0.0, min(1.0, (root - b) / a) - max(0.0, (-root - b) / a))
+    return inside / lines
+
+
+@njit(cache=True, nogil=True)
 def draw_discs(
     centre_mm: Float[np.ndarray, "d 3"],
     normal: Float[np.ndarray, "d 3"],
@@ -131,44 +173,40 @@ def draw_discs(
     grid_px: int,
     inverse_depth: Float32[np.ndarray, "h w"],
     tolerance_mm: float,
-    samples: int,
+    lines: int,
     grey: Float32[np.ndarray, "h w"],
 ) -> None:
     """Draws discs with a rim, in camera coordinates, by the share of each pixel's area that they cover.
 
-    Every sample of a pixel is a ray: undistorted (bilinear in a grid of slopes, a node each ``grid_px`` from
-    −``grid_px`` on), cut with the disc's plane, compared with the inner and the outer radius. A disc is hidden where
-    the surface is nearer by more than a tolerance.
+    The rays of a pixel's corners are undistorted (bilinear in a grid of slopes, a node each ``grid_px`` from
+    −``grid_px`` on) and taken as bilinear between. A ray p meets the disc of centre c, normal n and radius r where
+    |q| < r m, with m = n·p and q = (n·c) p − m c. A disc is hidden where the surface is nearer by more than a
+    tolerance.
     """
+    q, distance = np.empty((4, 4)), np.empty(4)  # of a pixel's corners: q and m; from the disc's centre (mm)
     for d in range(centre_mm.shape[0]):
-        cx, cy, cz = centre_mm[d, 0], centre_mm[d, 1], centre_mm[d, 2]
-        nx, ny, nz = normal[d, 0], normal[d, 1], normal[d, 2]
-        offset = nx * cx + ny * cy + nz * cz
-        inner2, outer2 = radius_mm[d, 0] ** 2, radius_mm[d, 1] ** 2
+        c, n = centre_mm[d], normal[d]
+        offset = n[0] * c[0] + n[1] * c[1] + n[2] * c[2]
         for v in range(box_px[d, 1], box_px[d, 3] + 1):
             for u in range(box_px[d, 0], box_px[d, 2] + 1):
-                in_inner, in_outer, z = 0, 0, cz
-                for a in range(samples):
-                    for b in range(samples):
-                        gu = (u + (a + 0.5) / samples - 0.5) / grid_px + 1
-                        gv = (v + (b + 0.5) / samples - 0.5) / grid_px + 1
-                        i, j = int(gu), int(gv)
-                        s, t = gu - i, gv - j
-                        x = (slopes[j, i, 0] * (1 - s) + slopes[j, i + 1, 0] * s) * (1 - t) + (
-                            slopes[j + 1, i, 0] * (1 - s) + slopes[j + 1, i + 1, 0] * s
-                        ) * t
-                        y = (slopes[j, i, 1] * (1 - s) + slopes[j, i + 1, 1] * s) * (1 - t) + (
-                            slopes[j + 1, i, 1] * (1 - s) + slopes[j + 1, i + 1, 1] * s
-                        ) * t
-                        z = offset / (nx * x + ny * y + nz)
-                        r2 = (z * x - cx) ** 2 + (z * y - cy) ** 2 + (z - cz) ** 2
-                        in_inner += r2 < inner2
-                        in_outer += r2 < outer2
-                if in_outer == 0 or inverse_depth[v, u] * (z - tolerance_mm) > 1:
+                z = 0.0
+                for k in range(4):  # corners: top left, top right, bottom left, bottom right
+                    x, y = _slope(slopes, (u - 0.5 + k % 2) / grid_px + 1, (v - 0.5 + k // 2) / grid_px + 1)
+                    m = n[0] * x + n[1] * y + n[2]
+                    q[k, 0], q[k, 1], q[k, 2], q[k, 3] = (
+                        offset * x - m * c[0],
+                        offset * y - m * c[1],
+                        offset - m * c[2],
+                        m,
+                    )
+                    distance[k] = np.sqrt(q[k, 0] ** 2 + q[k, 1] ** 2 + q[k, 2] ** 2) / abs(m)
+                    z += 0.25 * offset / m
+                if inverse_depth[v, u] * (z - tolerance_mm) > 1:
                     continue
-                white = in_inner / samples**2
-                rim = in_outer / samples**2 - white
-                grey[v, u] = grey[v, u] * (1 - white - rim) + value[d, 0] * white + value[d, 1] * rim
+                in_inner = _covered(q, distance, radius_mm[d, 0], lines)
+                in_outer = _covered(q, distance, radius_mm[d, 1], lines)
+                rim = in_outer - in_inner
+                grey[v, u] = grey[v, u] * (1 - in_outer) + value[d, 0] * in_inner + value[d, 1] * rim
 
 
 def warm_up() -> None:

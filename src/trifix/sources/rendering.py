@@ -13,8 +13,8 @@ from trifix.kernels.rendering import draw_discs, draw_faces, shade
 from trifix.sources.scenes import Scene
 from trifix.sources.sensing import camera_poses, circle_rim
 
-_GRID_PX = 4  # undistorted slopes are computed on a grid of this pitch: bilinear between is good to 0.001 px
-_SAMPLES = 8  # across a pixel
+_GRID_PX = 3  # undistorted slopes are computed on a grid of this pitch: bilinear between is good to 0.0002 px
+_LINES = 16  # into which a pixel is cut
 _STICKER = 1.5  # radius of the dark sticker, in radii of the target
 _BULGE_MM = 4.0  # by which a curved surface may stand before the plane of its target
 _WIDEST_SLOPE = 1.5  # triangles with corners beyond are far outside every image
@@ -109,7 +109,7 @@ class Renderer:
         box = np.concatenate([low.clip(0, last + 1), high.clip(-1, last)], axis=1).astype(np.int64)
         radius = np.tile([radius_mm, _STICKER * radius_mm], (len(box), 1))
         draw_discs(
-            *(centre, normal, radius, value, box, self._slopes[side], _GRID_PX, inverse_depth, _BULGE_MM, _SAMPLES),
+            *(centre, normal, radius, value, box, self._slopes[side], _GRID_PX, inverse_depth, _BULGE_MM, _LINES),
             grey,
         )
 
