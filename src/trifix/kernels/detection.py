@@ -36,6 +36,8 @@ _QUANTISATION_VARIANCE = 1.0 / 12.0
 _ALIASING_PX2 = 0.013**2
 _MIN_FILL = 0.75  # area of a blob in areas of the ellipse of its moments; small dots lose a quarter to their pixels
 _MAX_START = 0.4  # rms residual of a fit worth beginning, in steps
+_SMALL_PX = 2.5  # mean semi-axis of a dot whose surround may end within a wide window's reach all round
+_SHARP_PX = 1.0  # largest blur of such a dot
 _ENOUGH = 160  # pixels for the first, rough fit
 
 
@@ -434,6 +436,18 @@ def _normal_equations(
 
 
 @njit(cache=True, nogil=True)
+def _start(blob: np.ndarray, radius: float, x: np.ndarray) -> None:
+    """Starts the form and the blur from those of a blob, without gradients."""
+    # A uniform ellipse with form E has second moments E/4; A is the factor of E⁻¹ = AᵀA, in radii.
+    uu, uv, vv = 4 * blob[UU], 4 * blob[UV], 4 * blob[VV]
+    x[:] = 0.0
+    x[_P] = sqrt(vv) / radius
+    x[_R] = -uv / (radius * radius) / x[_P]
+    x[_T] = sqrt(uu / (radius * radius) - x[_R] * x[_R])
+    x[_S] = blob[BLUR] / radius
+
+
+@njit(cache=True, nogil=True)
 def _set_levels(pixels: np.ndarray, n: int, x: np.ndarray) -> bool:
     """Starts the levels of surround and step from the pixels clear of the edge; False where there are none."""
     around, inside, n_around, n_inside = 0.0, 0.0, 0, 0
@@ -556,24 +570,19 @@ def fit_ellipses(
     white = float(np.iinfo(image.dtype).max)
     for k in range(len(start)):
         u0, v0, sign = start[k, U], start[k, V], start[k, SIGN]
-        # A uniform ellipse with form E has second moments E/4; A is the factor of E⁻¹ = AᵀA, in radii.
-        uu, uv, vv = 4 * start[k, UU], 4 * start[k, UV], 4 * start[k, VV]
-        radius = (uu * vv - uv * uv) ** 0.25
-        x[:] = 0.0
-        x[_P] = sqrt(vv) / radius
-        x[_R] = -uv / (radius * radius) / x[_P]
-        x[_T] = sqrt(uu / (radius * radius) - x[_R] * x[_R])
-        x[_S] = start[k, BLUR] / radius
+        radius = (16 * (start[k, UU] * start[k, VV] - start[k, UV] ** 2)) ** 0.25
+        _start(start[k], radius, x)
         # Enough surround to tell light that changes from an edge that moves.
         reach = 2.0 if is_rough else 3.0 + 0.1 * radius
-        variance, needed = np.nan, reach + 3.0 * max(0.0, start[k, BLUR] - 0.8)
+        variance, enough_px = np.nan, 2e-3
+        needed = reach + 3.0 * max(0.0, start[k, BLUR] - 0.8)
         # A rough pass tells the noise, against which the prior is weighed, and where the edge lies; a second is final
         # unless the edge reaches beyond its window.
         for attempt in range(3):
             margin = needed
             n = _gather(image, u0, v0, radius, x, margin, margin + 2, pixels)
             if n == 0:
-                room = int((2 * (sqrt(max(uu, vv)) + margin) + 6) ** 2)
+                room = int((2 * (2 * sqrt(max(start[k, UU], start[k, VV])) + margin) + 6) ** 2)
                 pixels, J = np.empty((3, room), np.float32), np.ones((_N + 3, room), np.float32)
                 n = _gather(image, u0, v0, radius, x, margin, margin + 2, pixels)
             if attempt == 0:
@@ -594,24 +603,30 @@ def fit_ellipses(
             needed = reach + 3.0 * max(0.0, x[_S] * radius - 0.8)
             if is_rough or (attempt > 0 and needed < margin + 1):
                 break
-        if not variance >= 0:
-            continue
-        c_uu, c_uv, c_vv = _leading_inverse(H[0], L)
-        if not c_uu > 0:
-            continue
-        # More than noise remains: the surround may end near the edge (a sticker, a neighbour). Of the wide window and a
-        # narrow one, that with the smaller covariance is right.
-        if not is_rough and variance > 2 * max(noise * noise, _QUANTISATION_VARIANCE):
+        c_uu, c_uv, c_vv = np.nan, np.nan, np.nan
+        if variance >= 0:
+            c_uu, c_uv, c_vv = _leading_inverse(H[0], L)
+        # More than noise remains, or too much for any fit: the surround may end near the edge (a sticker, a neighbour).
+        # Of the wide window and a narrow one, that with the smaller covariance is right.
+        is_first = not c_uu > 0
+        is_worse = not variance <= 2 * max(noise * noise, _QUANTISATION_VARIANCE)
+        if not is_rough and is_worse and (not is_first or radius < _SMALL_PX):
+            if is_first:
+                _start(start[k], radius, x)
+                enough_px = 2e-3
             narrow[:] = x
             margin = max(1.5, 0.25 * radius)
             n = _gather(image, u0, v0, radius, narrow, margin, margin + 2, pixels)
-            if n > 2 * _N:
+            is_clear = n > 2 * _N and (not is_first or _set_levels(pixels, n, narrow))
+            if is_first and is_clear:
+                is_clear = sign * narrow[_STEP] >= min_contrast * max(narrow[_AROUND], narrow[_AROUND] + narrow[_STEP])
+            if is_clear:
                 found = _descend(
                     pixels,
                     n,
                     narrow,
                     radius,
-                    variance,
+                    max(1.0, 0.01 * narrow[_STEP] ** 2) if is_first else variance,
                     prior,
                     sign,
                     _MAX_START,
@@ -622,12 +637,15 @@ def fit_ellipses(
                     J,
                     H_narrow,
                 )
-                found = max(found, _QUANTISATION_VARIANCE) if found >= 0 else np.inf
-                if found < variance:
+                # By itself a narrow window tells clutter from dots only where the edge is sharp.
+                if found >= 0 and (not is_first or narrow[_S] * radius < _SHARP_PX):
+                    found = max(found, _QUANTISATION_VARIANCE)
                     n_uu, n_uv, n_vv = _leading_inverse(H_narrow[0], L)
-                    if found * (n_uu + n_vv) < variance * (c_uu + c_vv):
+                    if is_first or (found < variance and found * (n_uu + n_vv) < variance * (c_uu + c_vv)):
                         x[:], variance, H[:] = narrow, found, H_narrow
                         c_uu, c_uv, c_vv = n_uu, n_uv, n_vv
+        if not c_uu > 0:
+            continue
         # What sampling a sharp edge adds (px², each way): found to fall with the number of pixels along the edge, and
         # as the spectrum of the blur at the sampling frequency, exp(−2π²s²).
         blur_px = x[_S] * radius

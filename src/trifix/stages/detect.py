@@ -36,9 +36,9 @@ from trifix.kernels.detection import (
 )
 from trifix.records import Dots, GreyOrColour
 
-# A level of the pyramid answers for blobs from 6.5 to 14 of its own pixels across (the finest also for smaller ones);
+# A level of the pyramid answers for blobs from 8.5 to 19 of its own pixels across (the finest also for smaller ones);
 # the limits overlap, since a dot may be measured a little larger or smaller from one level to the next.
-_LEVEL_MIN_PX, _LEVEL_MAX_PX, _WINDOW_BLOCKS = 6.5, 14.0, 7
+_LEVEL_MIN_PX, _LEVEL_MAX_PX, _WINDOW_BLOCKS = 8.5, 19.0, 7
 _NOISE_RANGE = 9.0  # standard deviations that noise alone does not span within a window
 _LAG_PX = 6  # beyond which noise is not correlated
 _LEAST_STEP = 4.0  # standard deviations of the noise of single pixels
@@ -46,7 +46,7 @@ _LEAST_STEP = 4.0  # standard deviations of the noise of single pixels
 # deviations where it is of a pixel's size; and at most _NOISE_RANGE where they leave more than a fraction _CLEAN of the
 # step or _WHITE times the noise of single pixels. Specks, of a short semi-axis up to _SPECK_PX, have too few pixels to
 # leave anything: theirs are at most _SPECK.
-_LUMP, _CLEAN, _WHITE, _SPECK, _SPECK_PX = 4.5, 0.03, 1.3, 6.0, 1.5
+_LUMP, _CLEAN, _WHITE, _SPECK, _SPECK_PX = 4.5, 0.03, 1.3, 6.0, 2.0
 _QUANTILE = {1.0: 0.6745, 0.5: 0.3186}  # of the magnitude of a normal number: the middle of all, of the lower half
 # Prior knowledge, as standard deviations: relative change of the light per pixel (u, v); departure from light that
 # multiplies both sides of the edge alike, in contrasts per pixel (u, v).
