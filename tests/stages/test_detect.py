@@ -186,6 +186,61 @@ def test_dots_are_found_among_clutter() -> None:
     assert len(dots) < 2 * len(distance)
 
 
+def textured(rng: np.random.Generator, shape: tuple[int, int]) -> np.ndarray:
+    """Grey values of a ground whose texture has grains of 1 to 16 px, 120 on average."""
+    h, w = shape
+    ground = np.full(shape, 120.0)
+    for grain_px in (1, 2, 4, 8, 16):
+        grains = rng.standard_normal((h // grain_px + 1, w // grain_px + 1))
+        ground += 10 * cv2.resize(grains, (w, h), interpolation=cv2.INTER_CUBIC)
+    return ground
+
+
+def test_small_oblique_dots_on_narrow_stickers_are_found_in_texture() -> None:
+    rng, found = np.random.default_rng(11), []
+    for diameter_px in (5.4, 6.0):
+        ellipses = grid(rng, diameter_px, 63, 0.7, 4).ellipses
+        ellipses[:, :2] = np.mgrid[0:4, 0:4].reshape(2, -1).T * 60 + 30 + ellipses[:, :2] % 1
+        shape = (240, 240)
+        scene = render(ellipses, *shape, 0.7)
+        sticker = render(scene.ellipses * [1, 1, 2.6, 2.6, 1], *shape[::-1], 0.7).coverage
+        for around, inside in ((210, 30), (25, 210)):
+            image = textured(rng, shape) * (1 - sticker) + around * sticker
+            image += (inside - around) * scene.coverage + 2 * rng.standard_normal(shape)
+            dots = detect(np.clip(np.rint(image), 0, 255).astype(np.uint8), DetectOptions())
+            off = np.hypot(*(scene.ellipses[:, None, :2] - dots.uv_px[None]).transpose(2, 0, 1)).min(axis=1)
+            found.extend(off < 0.3)
+            assert len(dots) <= 16
+    assert np.mean(found) > 0.95
+
+
+def test_large_dots_on_narrow_stickers_are_found_in_texture() -> None:
+    rng = np.random.default_rng(12)
+    for diameter_px in (60, 116, 124, 150):
+        scene = grid(rng, diameter_px, 10, 0.7, 1)
+        shape = (300, 300)
+        u, v, *form = scene.ellipses[0]
+        ellipse = np.array([[150 + u % 1, 150 + v % 1, *form]])
+        dot, sticker = (render(ellipse * [1, 1, k, k, 1], *shape, 0.7).coverage for k in (1.0, 1.45))
+        image = textured(rng, shape) * (1 - sticker) + 25 * sticker + 185 * dot + 2 * rng.standard_normal(shape)
+        dots = detect(np.clip(np.rint(image), 0, 255).astype(np.uint8), BRIGHT)
+        assert len(dots) == 1
+        assert np.hypot(*(dots.uv_px[0] - ellipse[0, :2])) < 0.05
+
+
+def test_texture_by_itself_has_no_dots() -> None:
+    rng = np.random.default_rng(13)
+    for _ in range(4):
+        image = textured(rng, (700, 900)) + 2 * rng.standard_normal((700, 900))
+        assert len(detect(np.clip(np.rint(image), 0, 255).astype(np.uint8), DetectOptions())) == 0
+
+
+def test_a_dot_that_tells_nothing_of_the_light_is_left_as_it_is() -> None:
+    fit = np.arange(17.0)[None]
+    left = detection.share_gradients(fit, np.zeros((1, 4)), np.zeros((1, 6, 6)), np.full(4, 1e-3))
+    np.testing.assert_array_equal(left[0], fit[0, [0, 1, 7, 8, 9]])
+
+
 def test_the_edge_of_a_sticker_near_the_dot_does_not_spoil_the_covariance() -> None:
     rng = np.random.default_rng(8)
     scene = grid(rng, 16, 30, 0.7, 8)

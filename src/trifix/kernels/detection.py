@@ -720,7 +720,7 @@ def share_gradients(
                 top += np.sum(weight**2 * ((own[:, c] - mean[c]) ** 2 - np.minimum(error[:, c], 1e30)))
                 bottom += np.sum(weight**2)
             found = max(0.0, top / max(bottom, 1e-300))
-            tau2 = min((m * found + prior[i] ** 2) / (m + 1), found + 1 / (np.mean(weight) * sqrt(m)))
+            tau2 = min((m * found + prior[i] ** 2) / (m + 1), found + 1 / max(np.mean(weight) * sqrt(m), 1e-300))
         spread2[i:j] = tau2
     out = np.empty((m, 5))
     for k in range(m):

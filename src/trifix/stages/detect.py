@@ -44,9 +44,10 @@ _LAG_PX = 6  # beyond which noise is not correlated
 _LEAST_STEP = 4.0  # standard deviations of the noise of single pixels
 # Lumps of correlated noise or fine texture look like faint dots. Their steps are at most _LUMP of its standard
 # deviations where it is of a pixel's size; and at most _NOISE_RANGE where they leave more than a fraction _CLEAN of the
-# step or _WHITE times the noise of single pixels. Specks, of a short semi-axis up to _SPECK_PX, have too few pixels to
-# leave anything: theirs are at most _SPECK.
-_LUMP, _CLEAN, _WHITE, _SPECK, _SPECK_PX = 4.5, 0.03, 1.3, 6.0, 2.0
+# step or _WHITE times the noise of single pixels. Specks, of a short semi-axis up to _SPECK_PX, and twice that where
+# neighbours have more in common than single pixels differ, have too few pixels to leave anything: theirs are at most
+# _SPECK.
+_LUMP, _CLEAN, _WHITE, _SPECK, _SPECK_PX = 4.5, 0.03, 1.3, 6.0, 1.5
 _QUANTILE = {1.0: 0.6745, 0.5: 0.3186}  # of the magnitude of a normal number: the middle of all, of the lower half
 # Prior knowledge, as standard deviations: relative change of the light per pixel (u, v); departure from light that
 # multiplies both sides of the edge alike, in contrasts per pixel (u, v).
@@ -181,9 +182,11 @@ def _is_good(
     """
     u, v, a, b = fits[:, U], fits[:, V], fits[:, A], fits[:, B]
     around, step, misfit = fits[:, AROUND], fits[:, STEP], _misfit(fits, noise)
-    lumps = np.abs(step) / max(_noise(grey, _LAG_PX, 0.5), 1e-9)
+    common = _noise(grey, _LAG_PX, 0.5)
+    lumps = np.abs(step) / max(common, 1e-9)
+    speck_px = _SPECK_PX * (2 if common > _WHITE * noise else 1)
     is_clean = (misfit <= _CLEAN) | ((lumps >= _LUMP) & (fits[:, RESIDUAL] <= _WHITE * noise))
-    is_no_lump = (lumps >= _NOISE_RANGE) | (is_clean & ((lumps >= _SPECK) | (b > _SPECK_PX)))
+    is_no_lump = (lumps >= _NOISE_RANGE) | (is_clean & ((lumps >= _SPECK) | (b > speck_px)))
     h, w = grey.shape
     return np.asarray(
         (2 * a >= options.min_diameter_px)
