@@ -10,6 +10,7 @@ import pytest
 from made_steps import pose, rig, steps
 from test_report import reported
 
+from trifix.outputs import page as page_templates
 from trifix.outputs.course import Course, object_axes
 from trifix.outputs.space import space_of
 from trifix.records import ReferenceMap, Step, TargetState
@@ -93,6 +94,10 @@ def test_other_targets_are_seen_as_the_first_pose_looks_with_down_where_it_was_o
     assert abs(down @ mean / np.linalg.norm(mean) - 1) < 1e-9
     assert away @ shown.forward[0] > 0.8
     assert abs(right @ shown.forward[0]) < 1e-9
+
+
+def test_what_draws_it_is_small():
+    assert (Path(page_templates.__file__).parent / "space.js").stat().st_size < 25_000
 
 
 # --- in a browser ----------------------------------------------------------------------------------------------------

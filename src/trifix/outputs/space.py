@@ -10,14 +10,13 @@ from jaxtyping import Bool, Float, Int
 from trifix.geometry.camera import Camera, StereoRig
 from trifix.geometry.pose import Pose
 from trifix.outputs.course import Course, object_axes
+from trifix.outputs.scene3d import default_magnification, worst_shown_mm
 from trifix.outputs.summary import Tip
 from trifix.records import ReferenceMap, TargetState
 
 _MOST_POSES = 1500
 _SIGMAS = 3.0  # of the ellipsoids
-_TYPICAL = 0.1  # of the extent of the targets: no typical ellipsoid is magnified beyond that
 _SLOPE = 0.3  # of the view of a sensor whose cameras are not known
-_WORST_PERCENT = 95.0  # of the residuals lie below the end of the colours
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,13 +50,13 @@ def space_of(
     kept, is_after_gap = _thinned(is_found)
     row_of = dict(zip(shown.id.tolist(), range(len(shown)), strict=True))
     seen = [[row_of[each] for each in identified[k].tolist() if each in row_of] for k in kept.tolist()]
-    residual = course.residual_mm[is_found]
-    residual = residual[np.isfinite(residual)]
-    worst = _rounded_up(float(np.percentile(residual, _WORST_PERCENT))) if (residual > 0).any() else 1.0
+    trusted = shown.rows(np.flatnonzero(shown.state == TargetState.trusted))
+    extent = float(np.ptp(trusted.xyz_mm, axis=0).max()) if len(trusted) else 0.0
+    worst = worst_shown_mm(course.residual_mm)
     record = {
         "axes": _rounded(object_axes(course, targets), 5),
         "worst": worst,
-        "magnify": _magnification(shown),
+        "magnify": default_magnification(_SIGMAS**2 * trusted.cov_mm2, extent),
         "cameras": [_pyramid(Pose.identity(), None)] if rig is None else [
             _pyramid(Pose.identity(), rig.left), _pyramid(rig.T_right_left.inverse(), rig.right)
         ],
@@ -113,23 +112,6 @@ def _pyramid(T_left_camera: Pose, camera: Camera | None) -> list[float]:
             ]
     corners = T_left_camera.apply(np.c_[slopes, np.ones(4)])
     return [*_rounded(T_left_camera.t_mm, 3), *_rounded(corners - T_left_camera.t_mm, 4)]
-
-
-def _magnification(targets: ReferenceMap) -> float:
-    """A power of ten that makes a typical ellipsoid of trusted targets a small part of what they extend over."""
-    trusted = targets.state == TargetState.trusted
-    sigma = np.sqrt(np.trace(targets.cov_mm2[trusted], axis1=1, axis2=2) / 3)
-    if not (sigma > 0).any():
-        return 1.0
-    typical = _SIGMAS * float(np.median(sigma[sigma > 0]))
-    extent = float(np.ptp(targets.xyz_mm[trusted], axis=0).max())
-    return float(10.0 ** np.clip(np.floor(np.log10(max(_TYPICAL * extent / typical, 1.0))), 0, 4))
-
-
-def _rounded_up(value: float) -> float:
-    """The next number of one digit."""
-    power = 10.0 ** np.floor(np.log10(value))
-    return float(f"{np.ceil(value / power) * power:.1g}")
 
 
 def _rounded(values: Float[np.ndarray, "..."], decimals: int) -> list[float]:
