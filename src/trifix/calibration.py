@@ -29,6 +29,7 @@ _WORST_FOCAL = 0.02  # standard deviation of a focal length, relative, at which 
 _CAMERA = 8  # parameters of a camera; six of the pose follow those of both
 _RIG = 2 * _CAMERA + 6
 _SETTLED = 1e-10  # relative decrease of the cost below which the minimum is reached
+_UNDAMPED = 1e-9  # share of its curvature, added to a direction, that no longer shortens the step
 
 # OpenCV 4 keeps them in its module for these lenses, OpenCV 5 with all others; their values differ.
 _FISHEYE_FLAGS = sum(
@@ -407,9 +408,10 @@ def _adjust(
             damping *= 10
         if not tried_cost <= cost:
             break
-        decrease = 1 - tried_cost / max(cost, 1e-300)
+        # A damped step may be short although the minimum is far, along a valley: it does not end the search.
+        is_settled = cost - tried_cost <= _SETTLED * cost and damping < _UNDAMPED
         rig, poses, cost, damping = tried_rig, tried, tried_cost, damping / 10
-        if decrease < _SETTLED:
+        if is_settled:
             break
     return rig, poses
 
