@@ -17,6 +17,7 @@ from trifix.config import Config
 from trifix.geometry.pose import Pose
 from trifix.index import MapIndex
 from trifix.joint import JointMap
+from trifix.labels import TargetLabels, by_label
 from trifix.records import (
     Event,
     Fix,
@@ -70,6 +71,7 @@ class Island:
         if config.update.method == "joint" and not is_frozen:
             self._joint = JointMap(config.update.joint_targets)
             self._joint.adopt(map, np.flatnonzero(map.alive))
+        self.labels = TargetLabels()
         self.motion: Motion | None = None
         self._config = config
         self._is_frozen = is_frozen
@@ -88,7 +90,8 @@ class Island:
         """Points to hypotheses to poses to the one that is proven; where points leave it open, single dots decide."""
         budget = self._config.identify.max_hypotheses
         best, likeliest, tried = NoFix(Reason.no_candidate), None, list[Identification]()
-        portions = self._hypotheses(evidence.points, prediction)
+        target_label = self.labels.of(self.map)
+        portions = self._hypotheses(evidence.points, target_label, prediction)
         while True:
             with clock("identify"):
                 portion = next(portions, None)
@@ -112,7 +115,9 @@ class Island:
                     return portion, fix
         return likeliest, best
 
-    def _hypotheses(self, points: SensorPoints, prediction: Prediction | None) -> Iterator[Identification]:
+    def _hypotheses(
+        self, points: SensorPoints, target_label: Int[np.ndarray, "k"], prediction: Prediction | None
+    ) -> Iterator[Identification]:
         """Where the motion leads, first; then from nothing: those of the technique, and then any triangle at all."""
         options, gate = self._config.identify, self._config.verify.gate_sigmas
         if prediction is not None and options.start != "nothing" and self._config.verify.method == "probability":
@@ -121,10 +126,12 @@ class Island:
                 yield pairs_as_predicted(points, self.map, prediction.turned or prediction, gate)
         if options.start == "prediction" or len(points) < 3:
             return
-        yield from self.identifier.identify(points, self.map, self.motion.newest if self.motion else None)
+        for portion in self.identifier.identify(points, self.map, self.motion.newest if self.motion else None):
+            yield from by_label(portion, points, target_label)
         if options.widens:
             needed = fewest_points(self.index, points, self.map, self._config.verify)
-            yield from any_triangles(points, self.map, self.index, needed, options)
+            for portion in any_triangles(points, self.map, self.index, needed, options):
+                yield from by_label(portion, points, target_label)
 
     def _judge(
         self,
@@ -145,7 +152,8 @@ class Island:
             match options.method:
                 case "probability":
                     scene = evidence, self.map, self.index
-                    return verify(*scene, identification, orientations, earlier, prediction, asks_dots, options)
+                    label = self.labels.of(self.map)
+                    return verify(*scene, identification, orientations, earlier, prediction, asks_dots, options, label)
                 case "residual":
                     limits = options.counterpart_mm, options.max_residual_mm
                     return verify_residual(points, self.map, orientations, *limits)
@@ -167,6 +175,8 @@ class Island:
         self.follow(frame.timestamp_ns, fix)
         if self._is_frozen or fix.reason is PositionedReason.few_points:
             self.identifier.learn(self.map, fix.target)
+            if fix.reason is not PositionedReason.few_points:
+                self.labels.learn(self.map, points, fix.point, fix.target)
             return NOTHING
         if fix.reason is PositionedReason.defines_world:
             self.map, added = found_map(points, frame.index, next_id, self._joint)
@@ -180,6 +190,8 @@ class Island:
             known = before.rows(fix.target)
             self.map, self.events = self._care.tend(known, self.map, added, points, fix, frame, self._hand)
         self._follow_map(np.unique(np.concatenate([fix.target, added])))
+        self.labels.learn(self.map, points, fix.point, fix.target)
+        self.labels.enter(self.map, points, fix.T_world_sensor, np.setdiff1d(added, fix.target))
         return added
 
     def told(self, points: SensorPoints, fix: Fix) -> Fix:
@@ -233,6 +245,8 @@ class Island:
         self.frames += other.frames
         other.absorbed_by = self
         self._follow_map(np.unique(np.concatenate([bridge.target, added])))
+        self.labels.learn(self.map, points, bridge.point, bridge.target)
+        self.labels.enter(self.map, points, bridge.T_world_sensor, added)
         return len(added)
 
     def _follow_map(self, seen: Int[np.ndarray, "s"]) -> None:
@@ -254,7 +268,7 @@ class Island:
             xyz_mm=T_world_sensor.inverse().apply(self.map.xyz_mm[rows]),
             cov_mm2=R.T @ self.map.cov_mm2[rows] @ R,
             match=np.full(len(rows), -1),
-            label=np.full(len(rows), -1),
+            label=self.labels.of(self.map)[rows],
             row=np.arange(len(rows)),
         )
 

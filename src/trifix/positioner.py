@@ -21,10 +21,12 @@ from trifix.geometry.alignment import spread_off_line_mm
 from trifix.geometry.pose import Pose
 from trifix.island import NOTHING, Island, Stopwatch
 from trifix.records import (
+    Dots,
     Elsewhere,
     Event,
     Fix,
     Frame,
+    GreyOrColour,
     Identification,
     NoFix,
     PositionedReason,
@@ -38,8 +40,9 @@ from trifix.records import (
     StereoMatches,
     Unusable,
 )
-from trifix.stages.detect import detect
+from trifix.stages.detect import DetectOptions, detect
 from trifix.stages.identify import Identifier
+from trifix.stages.label import add_codes, add_hues
 from trifix.stages.match import match
 from trifix.stages.triangulate import correct_eccentricity, triangulate
 from trifix.stages.update import distinct, stored
@@ -181,7 +184,7 @@ class Positioner:
         content = frame.content
         if isinstance(content, StereoImages):
             with clock("detect"):
-                find = partial(detect, options=options.detect)
+                find = partial(_labelled_dots, options=options.detect)
                 left, right = self._cameras.map(find, (content.left, content.right))
             content = StereoDots(add_prior_noise(left, options.noise), add_prior_noise(right, options.noise))
         match content:
@@ -452,6 +455,14 @@ def position(
     steps = [step.remembered() for step in positioner.run(recording)]
     fixes = tuple(step.fix for step in positioner.revise(steps))
     return Positions(recording.index, recording.timestamp_ns, fixes, positioner.map.copy(), positioner.noise.scale)
+
+
+def _labelled_dots(image: GreyOrColour, options: DetectOptions) -> Dots:
+    """The dots of one image, with the labels that the options ask for."""
+    dots = detect(image, options)
+    if options.codes != "none":
+        dots = add_codes(dots, image, options.codes)
+    return add_hues(dots, image, options.hues_deg)
 
 
 def _define_world(points: SensorPoints) -> Fix | NoFix:

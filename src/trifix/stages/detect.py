@@ -54,6 +54,33 @@ _QUANTILE = {1.0: 0.6745, 0.5: 0.3186}  # of the magnitude of a normal number: t
 _GRADIENT_PER_PX = np.array([0.001, 0.001, 0.0007, 0.0007])
 
 
+Dictionary = Literal[
+    "none",
+    "DICT_4X4_50",
+    "DICT_4X4_100",
+    "DICT_4X4_250",
+    "DICT_4X4_1000",
+    "DICT_5X5_50",
+    "DICT_5X5_100",
+    "DICT_5X5_250",
+    "DICT_5X5_1000",
+    "DICT_6X6_50",
+    "DICT_6X6_100",
+    "DICT_6X6_250",
+    "DICT_6X6_1000",
+    "DICT_7X7_50",
+    "DICT_7X7_100",
+    "DICT_7X7_250",
+    "DICT_7X7_1000",
+    "DICT_ARUCO_ORIGINAL",
+    "DICT_APRILTAG_16h5",
+    "DICT_APRILTAG_25h9",
+    "DICT_APRILTAG_36h10",
+    "DICT_APRILTAG_36h11",
+    "DICT_ARUCO_MIP_36h12",
+]
+
+
 @dataclass(frozen=True)
 class DetectOptions:
     """What counts as a dot."""
@@ -71,6 +98,16 @@ class DetectOptions:
     max_misfit: float = 0.12
     """Largest rms residual of the fitted ellipse beyond the image's noise, as a fraction of the step; less refuses more
     clutter."""
+    codes: Dictionary = "none"
+    """Coded markers beside the round dots: OpenCV's dictionary of them. The code is the dot's label."""
+    hues: str = ""
+    """Hues of coloured dots (degrees: red 0, yellow 60, green 120, cyan 180, blue 240), such as "0 120 240": the number
+    of the nearest, from 0, is the dot's label; in colour images only."""
+
+    @property
+    def hues_deg(self) -> Float[np.ndarray, "h"]:
+        """The hues as numbers (degrees)."""
+        return np.array(self.hues.replace(",", " ").split(), dtype=float)
 
     def __post_init__(self) -> None:
         if not 0 < self.min_diameter_px < self.max_diameter_px:
@@ -78,6 +115,12 @@ class DetectOptions:
                 f"detect.min_diameter_px is {self.min_diameter_px}, expected more than 0 and less than "
                 f"max_diameter_px = {self.max_diameter_px}."
             )
+        try:
+            is_angle = bool(np.isfinite(self.hues_deg).all())
+        except ValueError:
+            is_angle = False
+        if not is_angle or len(np.unique(self.hues_deg % 360)) < len(self.hues_deg):
+            raise ConfigError(f"detect.hues is {self.hues!r}, expected different angles in degrees, as in '0 120 240'.")
         for name in ("min_axis_ratio", "min_contrast", "max_misfit"):
             if not 0 < getattr(self, name) <= 1:
                 raise ConfigError(f"detect.{name} is {getattr(self, name)}, expected a fraction above 0 and at most 1.")

@@ -53,17 +53,13 @@ def match(
 ) -> StereoMatches:
     """All pairs near each other's epipolar line, within the depth limits and of similar size.
 
-    ``noise_scale`` multiplies the dots' standard deviations.
+    Dots of different labels are no pair; but a label may be wrong, so a dot that finds none of its own is sought again
+    as if it had no label. ``noise_scale`` multiplies the dots' standard deviations.
     """
     parameters = rig.parameters
-    left, right, epipolar_px, epipolar_sigma_px = pair_dots(
-        _prepared(dots.left, parameters[:12]),
-        _prepared(dots.right, parameters[12:24]),
-        floats(dots.left.ellipse),
-        floats(dots.right.ellipse),
-        integers(dots.left.label),
-        integers(dots.right.label),
-        parameters,
+    prepared = _prepared(dots.left, parameters[:12]), _prepared(dots.right, parameters[12:24])
+    ellipses = floats(dots.left.ellipse), floats(dots.right.ellipse)
+    limits = (
         float(options.max_epipolar_sigmas),
         float(noise_scale),
         float(options.min_depth_mm or rig.baseline_mm),
@@ -71,7 +67,16 @@ def match(
         float(options.max_size_ratio),
         float(options.target_diameter_mm),
     )
-    return StereoMatches(left, right, epipolar_px, epipolar_sigma_px)
+    labels = integers(dots.left.label), integers(dots.right.label)
+    pairs = pair_dots(*prepared, *ellipses, *labels, parameters, *limits)
+    alone = [
+        (label >= 0) & (np.bincount(row, minlength=len(label)) == 0)
+        for label, row in zip(labels, pairs[:2], strict=True)
+    ]
+    if alone[0].any() or alone[1].any():
+        doubted = (np.where(is_alone, -1, label) for label, is_alone in zip(labels, alone, strict=True))
+        pairs = pair_dots(*prepared, *ellipses, *doubted, parameters, *limits)
+    return StereoMatches(*pairs)
 
 
 def _prepared(dots: Dots, camera: Float[np.ndarray, "12"]) -> Float[np.ndarray, "n 8"]:

@@ -9,11 +9,15 @@ from typing import Literal
 import numpy as np
 from jaxtyping import Float, Int
 
+from trifix.errors import ConfigError
 from trifix.geometry import triangulation
 from trifix.geometry.camera import StereoRig
 from trifix.kernels import floats, integers
 from trifix.kernels.stereo import centres_of_circles, prepare_dots, triangulate_pairs, views_of_circles, weigh_answers
+from trifix.labels import contradict
 from trifix.records import Dots, SensorPoints, StereoDots, StereoMatches
+
+_SIZE_REACH = 0.25  # of a class, as the logarithm of a ratio
 
 
 @dataclass(frozen=True, slots=True)
@@ -26,6 +30,24 @@ class TriangulateOptions:
     correct_eccentricity: bool = True
     """Whether dots are moved where their ellipses say that the targets' centres are, and their covariances widened by
     what the ellipses leave open; false takes the centres of the ellipses."""
+    diameters_mm: str = ""
+    """Diameters of targets of several sizes (mm), such as "3 6 12": the number of the nearest, from 0, is the label of
+    a point that has none; of ellipses only."""
+
+    @property
+    def classes_mm(self) -> Float[np.ndarray, "d"]:
+        """The diameters as numbers (mm)."""
+        return np.array(self.diameters_mm.replace(",", " ").split(), dtype=float)
+
+    def __post_init__(self) -> None:
+        try:
+            is_length = bool((np.isfinite(self.classes_mm) & (self.classes_mm > 0)).all())
+        except ValueError:
+            is_length = False
+        if not is_length or len(np.unique(self.classes_mm)) < len(self.classes_mm):
+            raise ConfigError(
+                f"triangulate.diameters_mm is {self.diameters_mm!r}, expected different lengths, as in '3 6 12'."
+            )
 
 
 def correct_eccentricity(
@@ -78,13 +100,31 @@ def triangulate(
         method = {"linear": triangulation.linear, "midpoint": triangulation.midpoint}[options.method]
         xyz, cov, good = _in_front(method, left[rows_left], right[rows_right], rig)
         cov *= noise_scale**2
+    labels = dots.left.label[rows_left[good]], dots.right.label[rows_right[good]]
+    label = np.where(contradict(*labels), -1, np.maximum(*labels))
+    if len(options.classes_mm):
+        in_right = rig.T_right_left.apply(xyz)
+        size_mm = np.sqrt(  # a circle keeps its long axis, however it is tilted
+            2 * dots.left.ellipse[rows_left[good], 0] * xyz[:, 2] / rig.left.fu_px
+            * 2 * dots.right.ellipse[rows_right[good], 0] * in_right[:, 2] / rig.right.fu_px
+        )  # fmt: skip
+        label = np.where(label < 0, _size_class(size_mm, options.classes_mm), label)
     return SensorPoints(
         xyz_mm=xyz,
         cov_mm2=cov,
         match=good,
-        label=integers(np.maximum(dots.left.label[rows_left[good]], dots.right.label[rows_right[good]])),
+        label=integers(label),
         row=np.arange(len(good)),
     )
+
+
+def _size_class(size_mm: Float[np.ndarray, "n"], classes_mm: Float[np.ndarray, "d"]) -> Int[np.ndarray, "n"]:
+    """Number of the nearest class in ratio; -1 for unknown sizes and for those between or beyond classes."""
+    off = np.abs(np.log(size_mm[:, None] / classes_mm))
+    apart = np.abs(np.log(classes_mm[:, None] / classes_mm)) + np.where(np.eye(len(classes_mm)), np.inf, 0.0)
+    reach = min(_SIZE_REACH, 0.4 * apart.min())
+    nearest = np.nan_to_num(off, nan=np.inf).argmin(axis=1)
+    return np.where(off[np.arange(len(off)), nearest] <= reach, nearest, -1)
 
 
 def _in_front(

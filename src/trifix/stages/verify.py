@@ -11,6 +11,7 @@ The last motion is evidence too, and so are targets that should be seen and are 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
+from math import comb
 from typing import Literal
 
 import numpy as np
@@ -24,6 +25,7 @@ from trifix.index import ANYWHERE_UP_TO, Candidates, MapIndex, frame_triangles
 from trifix.kernels import floats
 from trifix.kernels import positioning as kernels
 from trifix.kernels.stereo import prepare_dots
+from trifix.labels import contradict
 from trifix.records import (
     Fix,
     Identification,
@@ -40,6 +42,8 @@ from trifix.records import (
     StereoMatches,
     TargetState,
 )
+
+_NO_ROWS = np.zeros(0, np.int64)
 
 
 @dataclass(frozen=True, slots=True)
@@ -65,6 +69,9 @@ class VerifyOptions:
     """Largest standard deviation of the identified points as the pose places them, rms over them (mm)."""
     max_sigma_deg: float = 0.17
     """Largest standard deviation of the rotation about any axis (degrees)."""
+    label_error: float = 1.0
+    """Probability that a label is wrong, by which those that contradict their targets' speak against a rival; 1: labels
+    never decide between rivals."""
     max_solutions: int = 12
     """Rivals to work out in full at most."""
     max_rivals: int = 20_000
@@ -77,6 +84,8 @@ class VerifyOptions:
             raise ConfigError(f"verify.min_rival_odds is {self.min_rival_odds}, expected at least 1.")
         if min(self.counterpart_mm, self.max_residual_mm) <= 0:
             raise ConfigError("verify.counterpart_mm and verify.max_residual_mm must be positive.")
+        if not 0 < self.label_error <= 1:
+            raise ConfigError(f"verify.label_error is {self.label_error}, expected a probability above 0.")
         if min(self.gate_sigmas, self.max_sigma_mm, self.max_sigma_deg, self.max_solutions) <= 0:
             raise ConfigError("verify.gate_sigmas, max_sigma_mm, max_sigma_deg and max_solutions must be positive.")
 
@@ -141,6 +150,10 @@ class Solution:
     """ln of the likelihood ratio of the points against chance, each predicted from those before it; motion aside."""
     p_chance: float
     """Bound of the probability that the agreement is chance."""
+    contradicted: int = 0
+    """Points whose label is not that of their target, where labels decide between rivals."""
+    labelled: int = 0
+    """Points that have a label, as their targets have, there."""
 
     @property
     def rms_mm(self) -> float:
@@ -165,12 +178,12 @@ _THICK = 10.0  # standard deviations of points, rms about a plane, in which poin
 _SCALE_SIGMAS = 3.0  # of the size of what agrees, beyond which another size is tried
 _MOSTLY = 0.8  # of the points explained, their own triangles are those of all points
 _TRIPLES = 2_500  # of points, to be sought all over the map
+_LABELS_HOLD = 1e-3  # probability of so many wrong labels, below which they are not what they are said to be
 _OWN_ODDS = 100.0  # a rival that explains many points is one only if they are evidence of it, motion aside
 _NOWHERE = (np.eye(3), np.zeros(3), np.zeros((6, 6)))
 _NO_DOTS = (np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros((0, 2)), np.zeros((0, 2, 2)))
 _NO_CAMERAS = (np.zeros((2, 3, 3)), np.zeros((2, 3)))
 _VALID = np.ones(1, dtype=np.bool_)
-_NO_ROWS = np.zeros(0, np.int64)
 
 
 def verify(
@@ -183,10 +196,12 @@ def verify(
     prediction: Prediction | None = None,
     asks_dots: bool = False,
     options: VerifyOptions = VerifyOptions(),
+    target_label: Int[np.ndarray, "k"] = _NO_ROWS,
 ) -> Fix | NoFix:
     """The one pose that the frame proves, or why there is none.
 
     ``index`` is that of the map as it is now. ``earlier`` are the hypotheses that this frame has cost before these.
+    ``target_label`` are the labels of the targets, -1 where unknown; they prove nothing, but may speak against rivals.
 
     Every hypothesis gets a first look; the best are worked out over all points, until one is proven. Then its rivals
     are sought: all poses that could explain so many points that the frame would be ambiguous. Of two points that share
@@ -195,7 +210,7 @@ def verify(
     if len(identification) == 0:
         return NoFix(Reason.no_candidate)
     enough = np.log(max(sum(len(each) for each in earlier) + len(identification), 1) / options.max_p_chance)
-    weighed = _Weighed(evidence, map, index, prediction, options)
+    weighed = _Weighed(evidence, map, index, prediction, options, target_label)
     if asks_dots:
         weighed.ask_dots()
     found = weighed.candidates(identification, orientations, earlier, enough)
@@ -209,10 +224,11 @@ def verify(
         )
         return NoFix(Reason.not_proven, detail, best.p_chance, len(best.point), best.rms_mm)
     found += weighed.rivals(found, best)
-    best = max(found, key=lambda each: each.log_likelihood)
+    weighed.doubt_labels(found)
+    best = max(found, key=weighed.odds)
     rivals = [each for each in found if each is not best and weighed.is_rival(best, each)]
     if rivals or best.p_chance > options.max_p_chance:
-        rivals = sorted(rivals or found, key=lambda each: -each.log_likelihood)
+        rivals = sorted(rivals or found, key=lambda each: -weighed.odds(each))
         told = tuple(each.as_rival() for each in [best, *(each for each in rivals if each is not best)])
         explained = ", ".join(str(each.matched) for each in told[:4])
         detail = f"{len(told)} poses explain {explained} points."
@@ -239,8 +255,11 @@ class _Weighed:
         index: MapIndex,
         prediction: Prediction | None,
         options: VerifyOptions,
+        target_label: Int[np.ndarray, "k"] = _NO_ROWS,
     ) -> None:
         self._evidence, self._map, self._index = evidence, map, index
+        self._target_label = target_label if options.label_error < 1 else _NO_ROWS
+        self._log_label_error = float(np.log(options.label_error))
         self._prediction, self._options = prediction, options
         points = evidence.points
         self._frame = (points.xyz_mm, points.cov_mm2, evidence.left, evidence.right)
@@ -310,6 +329,7 @@ class _Weighed:
             # a hypothesis of fewer than three pairs rests on the motion itself: it has been counted
             evidence = log_ratio[k] + (gain if identification.point.shape[1] >= 3 else 0.0)
             p_chance = self._p_chance(evidence, matched[k], identification, earlier)
+            contradicted, labelled = self._labels(point, matched[k, point])
             solutions.append(
                 Solution(
                     T_world_sensor=T,
@@ -322,9 +342,29 @@ class _Weighed:
                     log_likelihood=float(log_likelihood[k] + gain),
                     log_ratio=float(log_ratio[k]),
                     p_chance=p_chance,
+                    contradicted=contradicted,
+                    labelled=labelled,
                 )
             )
         return solutions
+
+    def _labels(self, point: Int[np.ndarray, "c"], target: Int[np.ndarray, "c"]) -> tuple[int, int]:
+        """How many points bear another label than their target, and how many any, if labels decide between rivals."""
+        if not len(self._target_label):
+            return 0, 0
+        label, known = self._evidence.points.label[point], self._target_label[target]
+        return int(contradict(label, known).sum()), int(((label >= 0) & (known >= 0)).sum())
+
+    def odds(self, solution: Solution) -> float:
+        """ln of the likelihood of a solution, labels included: for comparison among solutions."""
+        return solution.log_likelihood + solution.contradicted * self._log_label_error
+
+    def doubt_labels(self, found: Sequence[Solution]) -> None:
+        """From now on, labels mean nothing if they contradict even the best solution more often than they may err."""
+        best = max(found, key=self.odds)
+        wrong = best.contradicted
+        if comb(best.labelled, wrong) * np.exp(wrong * self._log_label_error) < _LABELS_HOLD:
+            self._log_label_error = 0.0
 
     def _p_chance(
         self,
@@ -388,7 +428,7 @@ class _Weighed:
         most_gain = (
             0.0 if self._prediction is None else self._motion_gain(self._prediction.T_world_sensor, best.spacing_mm)
         )
-        least = best.log_likelihood - most_gain - np.log(options.min_rival_odds)
+        least = self.odds(best) - most_gain - np.log(options.min_rival_odds)
         by_odds = int(np.ceil(least / self._index.largest_evidence(points, self._map)))
         needed = max(3, min(int(np.ceil(options.max_rival_share * len(best.point))), by_odds))
         if len(points) < needed:
@@ -442,10 +482,13 @@ class _Weighed:
         apart = (best.T_world_sensor.inverse() @ other.T_world_sensor).apply(points.xyz_mm[p]) - points.xyz_mm[p]
         d2 = np.einsum("ni,ni->n", apart, np.linalg.solve(points.cov_mm2[p], apart[:, :, None])[:, :, 0])
         is_elsewhere = np.median(d2) > options.gate_sigmas**2
-        is_near = best.log_likelihood - other.log_likelihood < np.log(options.min_rival_odds)
+        is_near = self.odds(best) - self.odds(other) < np.log(options.min_rival_odds)
         if is_elsewhere and is_near:
             return True
-        explains_as_many = len(other.point) >= options.max_rival_share * len(best.point)
+        best_share, share = (
+            len(each.point) - (each.contradicted if self._log_label_error else 0) for each in (best, other)
+        )
+        explains_as_many = share >= options.max_rival_share * best_share
         if not explains_as_many or other.log_ratio < np.log(_OWN_ODDS) or len(best.point) == 0:
             return False
         return bool(np.median(np.linalg.norm(apart, axis=1) / best.spacing_mm) > 0.5)
