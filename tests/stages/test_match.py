@@ -163,6 +163,13 @@ def test_labels_must_agree_where_both_dots_have_one():
     assert pairs(match(dots, PARALLEL)) == {(i, j) for i in range(3) for j in range(3)} - {(0, 2), (1, 0)}
 
 
+def test_a_dot_that_finds_none_of_its_label_is_sought_as_if_it_had_none():
+    xyz = np.array([[0.0, 10.0, 400.0], [30.0, 60.0, 410.0]])
+    dots = seen_dots(xyz, np.random.default_rng(4), 0.05, PARALLEL)
+    dots = StereoDots(replace(dots.left, label=np.array([1, 2])), replace(dots.right, label=np.array([1, 3])))
+    assert pairs(match(dots, PARALLEL)) == {(0, 0), (1, 1)}
+
+
 @pytest.mark.parametrize(("left", "right"), [(0, 0), (0, 3), (3, 0)])
 def test_without_dots_there_are_no_pairs(left, right):
     uv = np.array([[600.0, 500.0], [640.0, 510.0], [700.0, 520.0]])

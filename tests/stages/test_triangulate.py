@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from constellations import PARALLEL, RIG, chi2_limits, seen_dots
+from trifix.errors import ConfigError
 from trifix.geometry import triangulation
 from trifix.geometry.camera import StereoRig
 from trifix.records import Dots, StereoDots, StereoMatches
@@ -124,6 +125,31 @@ def test_a_point_has_the_label_of_either_dot():
     dots = seen_dots(np.tile([[50.0, 0.0, 450.0]], (3, 1)), np.random.default_rng(5), 0.0)
     dots = StereoDots(replace(dots.left, label=np.array([7, -1, -1])), replace(dots.right, label=np.array([-1, 3, -1])))
     np.testing.assert_array_equal(triangulate(dots, paired([0, 1, 2], [0, 1, 2]), RIG).label, [7, 3, -1])
+
+
+def test_a_point_of_two_labels_has_none():
+    dots = seen_dots(np.array([[50.0, 0.0, 450.0]]), np.random.default_rng(5), 0.0)
+    dots = StereoDots(replace(dots.left, label=np.array([7])), replace(dots.right, label=np.array([3])))
+    np.testing.assert_array_equal(triangulate(dots, paired([0], [0]), RIG).label, [-1])
+
+
+def test_points_are_labelled_by_the_size_of_their_ellipses():
+    """3, 6 and 12 mm wide, tilted, between two classes, unknown, and with a label already."""
+    xyz = np.tile([[50.0, 0.0, 450.0]], (6, 1))
+    dots, a = seen_dots(xyz, np.random.default_rng(5), 0.0), np.array([1.5, 3.0, 6.0, 2.1, np.nan, 3.0])
+    sides = []
+    for one, camera, z in (
+        (dots.left, RIG.left, xyz[:, 2]),
+        (dots.right, RIG.right, RIG.T_right_left.apply(xyz)[:, 2]),
+    ):
+        px = a * camera.fu_px / z
+        sides.append(replace(one, ellipse=np.c_[px, 0.5 * px, 0 * px], label=np.array([-1, -1, -1, -1, -1, 9])))
+    options = TriangulateOptions(diameters_mm="3, 6 12")
+    points = triangulate(StereoDots(*sides), paired([*range(6)], [*range(6)]), RIG, 1.0, options)
+    np.testing.assert_array_equal(points.label, [0, 1, 2, -1, -1, 9])
+    for wrong in ("small", "3 3", "-1 2"):
+        with pytest.raises(ConfigError, match="different lengths"):
+            TriangulateOptions(diameters_mm=wrong)
 
 
 def test_without_pairs_there_are_no_points():
