@@ -86,17 +86,18 @@ def test_marks_are_drawn_where_the_dots_are(folder: tuple[Path, list[Step]]) -> 
 
 def test_what_is_no_finished_run_is_refused_in_one_sentence(folder: tuple[Path, list[Step]], tmp_path: Path) -> None:
     path, _ = folder
-    with pytest.raises(RecordingError, match="is not a folder, expected the results of `trifix run`"):
+    with pytest.raises(RecordingError, match="is not a folder, expected results that `trifix run` wrote"):
         FinishedRun(tmp_path / "nothing")
-    with pytest.raises(RecordingError, match=r"holds no summary\.json, expected the results of `trifix run`"):
-        FinishedRun(tmp_path)
-    (tmp_path / "summary.json").write_text("{")
-    with pytest.raises(RecordingError, match="is not JSON"):
+    with pytest.raises(RecordingError, match=r"holds no summary\.json: expected results that `trifix run` wrote"):
         FinishedRun(tmp_path)
     (tmp_path / "summary.json").write_text("{}")
+    with pytest.raises(RecordingError, match="is no summary of a run"):
+        FinishedRun(tmp_path)
+    (tmp_path / "summary.json").write_text((path / "results" / "summary.json").read_text())
     with pytest.raises(RecordingError, match=r"frames\.csv does not exist"):
         FinishedRun(tmp_path)
-    (tmp_path / "frames.csv").write_text((path / "results" / "frames.csv").read_text().split("\n")[0] + "\n")
+    for name in ("frames.csv", "poses.csv", "sightings.csv", "map.csv"):
+        (tmp_path / name).write_text((path / "results" / name).read_text().split("\n")[0] + "\n")
     with pytest.raises(RecordingError, match="has not positioned or refused any frame yet"):
         FinishedRun(tmp_path)
 

@@ -1,9 +1,14 @@
+from itertools import combinations
+
 import numpy as np
 import pytest
+from test_colours import EYES, luminance, oklab
 
 from trifix.geometry.pose import Pose, exp_rotation
 from trifix.outputs import scene3d
 from trifix.outputs.scene3d import (
+    COLOUR,
+    PLACE,
     Path,
     default_magnification,
     ellipsoids,
@@ -12,6 +17,25 @@ from trifix.outputs.scene3d import (
     residual_colours,
     worst_shown_mm,
 )
+
+GROUNDS = {"light": np.full(3, 255), "dark": np.full(3, 20)}
+
+
+def linear(rgb: tuple[int, int, int] | np.ndarray) -> np.ndarray:
+    return (np.asarray(rgb) / 255) ** 2.2
+
+
+@pytest.mark.parametrize("eyes", EYES)
+def test_states_of_targets_and_the_place_that_is_wanted_look_different_to_all_eyes(eyes: str) -> None:
+    seen = [oklab(EYES[eyes] @ linear(rgb)) for rgb in (*COLOUR.values(), PLACE)]
+    assert min(float(np.linalg.norm(a - b)) for a, b in combinations(seen, 2)) > 7
+
+
+@pytest.mark.parametrize("ground", GROUNDS)
+def test_colours_stand_out_from_light_and_from_dark_ground(ground: str) -> None:
+    for rgb in (*COLOUR.values(), PLACE):
+        low, high = sorted((luminance(linear(rgb)), luminance(linear(GROUNDS[ground]))))
+        assert (high + 0.05) / (low + 0.05) > 3
 
 
 def rotation(wxyz: np.ndarray) -> np.ndarray:
@@ -49,9 +73,9 @@ def test_meshes_look_outwards_and_have_about_the_radius_one(name: str) -> None:
     assert 0.95 < np.linalg.norm(vertices, axis=1).max() < 1.2
 
 
-def test_colours_go_from_teal_to_orange_and_are_grey_where_nothing_is_known() -> None:
+def test_colours_go_from_blue_to_orange_and_are_grey_where_nothing_is_known() -> None:
     rgb = residual_colours(np.array([0.0, 0.5, 1.0, 9.0, np.nan]), 1.0).astype(int)
-    assert (np.diff(rgb[:3, 0]) > 0).all()
+    assert (np.diff(rgb[:3, 2]) < 0).all()
     assert (rgb[2] == rgb[3]).all()
     assert np.ptp(rgb[4]) < 30
 

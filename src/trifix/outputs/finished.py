@@ -1,21 +1,18 @@
 """A results folder, read back to be looked at frame by frame. Judges nothing again; asks a recording for its images."""
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
-import msgspec
 import numpy as np
 from jaxtyping import Float, Int
 
 from trifix.errors import RecordingError, TrifixError
-from trifix.files.maps import read_map
-from trifix.files.recordings import LEVELS, Level, Recording, read_recording
+from trifix.files.recordings import LEVELS, read_recording
 from trifix.files.tables import Table, read_table
-from trifix.files.trajectories import read_poses
 from trifix.geometry.camera import Camera, StereoRig
 from trifix.geometry.pose import Pose
 from trifix.outputs.advice import Advice, advice_on
+from trifix.outputs.comparison import read_run
 from trifix.outputs.moments import Moment, Shot, event_words, sigma_of
 from trifix.outputs.samples import HEIGHT_PX, KINDS, WIDTH_PX, points_by_kind
 from trifix.records import (
@@ -55,41 +52,20 @@ class FinishedRun:
             RecordingError: the folder holds no results, or none yet, or the recording is another one.
             MapError: its map cannot be read.
         """
-        self.path = out
-        summary = _summary(out)
-        self.name = str(summary.get("recording", out.name))
-        self.is_finished = summary.get("finished") is True
-        self.frames_per_s = _number(summary.get("frames_per_s"))
-        numbers = {"points": int, "matched": int}
-        self._frames = read_table(
-            out / "frames.csv",
-            {"frame": int, "timestamp_ns": int, "status": str},
-            {"reason": str, "detail": str, "residual_mm": float, "p_chance": float} | numbers,
-        )
-        self.frame: np.ndarray = self._frames["frame"]
-        """Numbers of the frames."""
-        if not len(self.frame):
+        run = read_run(out)
+        self.name, self.is_finished = run.summary.recording, run.summary.finished
+        self.frames_per_s = run.summary.frames_per_s
+        self.course, self.targets = run.course, run.map
+        if not len(self):
             raise RecordingError(f"{out} holds a run that has not positioned or refused any frame yet.")
-        self.is_positioned: np.ndarray = self._frames["status"] == "positioned"
-        """Which of them have a pose."""
-        empty = np.full(len(self.frame), "", dtype=object)
-        self.reason: tuple[str, ...] = tuple(self._frames.get("reason", empty))
-        """Names of their reasons, empty where there is none."""
-        self._detail = self._frames.get("detail", empty)
-        nan = np.full(len(self.frame), np.nan)
-        self.residual_mm = np.where(self.is_positioned, self._frames.get("residual_mm", nan), np.nan)
-        """Rms residuals of the positioned frames (mm)."""
-        self._p_chance = self._frames.get("p_chance", nan)
-        none = np.zeros(len(self.frame), dtype=np.int64)
-        self.points, self.matched = self._frames.get("points", none), self._frames.get("matched", none)
-        posed, _, poses, cov = read_poses(out / "poses.csv")
-        row_of = {int(frame): k for k, frame in enumerate(posed)}
-        rows = [row_of.get(int(frame)) for frame in self.frame]
-        self.poses: tuple[Pose | None, ...] = tuple(None if row is None else poses[row] for row in rows)
+        self.reason: tuple[str, ...] = run.reason
+        """Names of the frames' reasons, empty where there is none."""
+        self.poses: tuple[Pose | None, ...] = tuple(run.poses.get(frame) for frame in self.course.frame.tolist())
         """Their poses, None where refused."""
-        self._sigma_mm = [float("nan") if row is None else sigma_of(cov[row]) for row in rows]
-        self.targets = read_map(out / "map.csv")
-        """The targets in the end."""
+        self._timestamp_ns, self._cov = run.timestamp_ns, run.cov
+        self._frames = read_table(
+            out / "frames.csv", {"frame": int}, {"detail": str, "residual_mm": float, "p_chance": float}
+        )
         self._sightings = read_table(
             out / "sightings.csv",
             {"frame": int, "kind": str, "row": int, "target": int},
@@ -99,9 +75,12 @@ class FinishedRun:
         self._of_target = _rows_of(self._sightings["target"])
         self._events = _events(out)
         self._total_ms = _timings(out)
-        self._recording = None if recording is None else _recording(recording, summary)
+        self._recording = None
+        if recording is not None:  # at the level at which it was positioned
+            level = next((each for each in LEVELS if each == run.summary.level), None)
+            self._recording = read_recording(recording, level)
         self._at = {} if self._recording is None else {int(f): k for k, f in enumerate(self._recording.index)}
-        if self._recording is not None and not set(self._at) & set(self.frame.tolist()):
+        if self._recording is not None and not set(self._at) & set(self.course.frame.tolist()):
             raise RecordingError(
                 f"{recording} has none of the frames in {out}: name the recording that was positioned."
             )
@@ -110,7 +89,7 @@ class FinishedRun:
         self._dots_of = {} if self._dots is None else _rows_of(self._dots["frame"])
 
     def __len__(self) -> int:
-        return len(self.frame)
+        return len(self.course.frame)
 
     @property
     def rig(self) -> StereoRig | None:
@@ -119,11 +98,11 @@ class FinishedRun:
 
     def latency_ms(self, k: int) -> float:
         """How long the k-th frame took (ms); NaN where that is not known."""
-        return self._total_ms.get(int(self.frame[k]), float("nan"))
+        return self._total_ms.get(int(self.course.frame[k]), float("nan"))
 
     def position(self, frame: int) -> int:
         """Which of the frames has this number, or the next one after it."""
-        return min(int(np.searchsorted(self.frame, frame)), len(self) - 1)
+        return min(int(np.searchsorted(self.course.frame, frame)), len(self) - 1)
 
     def sightings(self, target: int) -> Sightings:
         """Where a target was identified; nowhere, if there is no such target."""
@@ -141,23 +120,23 @@ class FinishedRun:
 
     def moment(self, k: int) -> Moment:
         """What is shown of the k-th frame."""
-        index, stamp = int(self.frame[k]), int(self._frames["timestamp_ns"][k])
+        index, unknown = int(self.course.frame[k]), float("nan")
         rows = self._of_frame.get(index, np.zeros(0, dtype=np.int64))
         seen = None
         if self._recording is not None and index in self._at:
             seen = self._recording.frame(self._at[index])
         return Moment(
             frame=index,
-            timestamp_ns=stamp,
+            timestamp_ns=int(self._timestamp_ns[k]),
             pose=self.poses[k] or self._last_pose(k),
-            is_positioned=bool(self.is_positioned[k]),
+            is_positioned=self.poses[k] is not None,
             reason=self.reason[k],
-            detail=str(self._detail[k]),
-            points=int(self.points[k]),
-            matched=int(self.matched[k]),
-            residual_mm=float(self._frames["residual_mm"][k]) if "residual_mm" in self._frames else float("nan"),
-            p_chance=float(self._p_chance[k]),
-            sigma_mm=self._sigma_mm[k],
+            detail=str(self._frames["detail"][k]) if "detail" in self._frames else "",
+            points=int(self.course.points[k]),
+            matched=int(self.course.matched[k]),
+            residual_mm=float(self._frames["residual_mm"][k]) if "residual_mm" in self._frames else unknown,
+            p_chance=float(self._frames["p_chance"][k]) if "p_chance" in self._frames else unknown,
+            sigma_mm=sigma_of(self._cov[index]) if index in self._cov else unknown,
             targets=np.unique(self._sightings["target"][rows]),
             rig=None if seen is None else seen.rig,
             shots=() if seen is None else self._shots(seen, k, rows),
@@ -171,7 +150,7 @@ class FinishedRun:
     def _advice(self, k: int, rig: StereoRig | None) -> Advice | None:
         """What its reason calls for."""
         reasons = {each.name: each for each in (*Reason, *PositionedReason)}
-        count = self.matched[k] if self.is_positioned[k] else self.points[k]
+        count = self.course.points[k] if self.poses[k] is None else self.course.matched[k]
         return advice_on(
             reasons.get(self.reason[k]), int(count), self.poses[k] or self._last_pose(k), rig, self.targets
         )
@@ -227,36 +206,15 @@ class FinishedRun:
         dots = dict.fromkeys(KINDS, np.zeros((0, 2)))
         dots |= {
             "identified": uv_px[is_found],
-            "unidentified" if self.is_positioned[k] else "refused": uv_px[~is_found],
+            "refused" if self.poses[k] is None else "unidentified": uv_px[~is_found],
         }
         return Shot(image, camera.width_px, camera.height_px, dots)
-
-
-def _summary(out: Path) -> dict[str, object]:
-    if not out.is_dir():
-        raise RecordingError(f"{out} is not a folder, expected the results of `trifix run`.")
-    try:
-        summary = msgspec.json.decode((out / "summary.json").read_bytes())
-    except OSError:
-        raise RecordingError(f"{out} holds no summary.json, expected the results of `trifix run`.") from None
-    except msgspec.DecodeError as fault:
-        raise RecordingError(f"{out / 'summary.json'} is not JSON: {fault}.") from None
-    if not isinstance(summary, dict):
-        raise RecordingError(f"{out / 'summary.json'} holds no table, expected the summary of a run.")
-    return summary
-
-
-def _recording(path: Path, summary: Mapping[str, object]) -> Recording:
-    """The recording at the level at which it was positioned."""
-    named = summary.get("level")
-    level: Level | None = next((each for each in LEVELS if each == named), None)
-    return read_recording(path, level)
 
 
 def recording_beside(out: Path) -> Path | None:
     """The recording of a run, if it lies beside its results."""
     try:
-        path = out.resolve().parent / str(_summary(out).get("recording", ""))
+        path = out.resolve().parent / read_run(out).summary.recording
         return path if path != out.resolve() and path.is_dir() and read_recording(path) else None
     except TrifixError:
         return None
@@ -292,7 +250,3 @@ def _timings(out: Path) -> dict[int, float]:
         return {}
     table = read_table(file, {"frame": int, "total_ms": float})
     return dict(zip(table["frame"].tolist(), table["total_ms"].tolist(), strict=True))
-
-
-def _number(value: object) -> float:
-    return float(value) if isinstance(value, int | float) else float("nan")

@@ -23,7 +23,7 @@ DOT_COLOUR = {
 """Of dots, by what became of them: the report's colours."""
 
 _CANVAS = (38, 43, 49)
-_WANTED = (255, 92, 168)
+_WANTED = (232, 122, 224)
 _FINE = 3  # bits of a pixel to which OpenCV draws
 
 

@@ -250,6 +250,13 @@ def target_card(target: int, targets: ReferenceMap, sightings: Sightings, frame:
     return f'<div class="tf">{"".join(lines)}<table>{head}{body}</table></div>'
 
 
+def next_run(advice: Sequence[str]) -> str:
+    """What would help the next run over the same object."""
+    if not advice:
+        return ""
+    return f'<div class="tf"><h4>For the next run</h4>{"".join(f"<p>{escape(each)}</p>" for each in advice)}</div>'
+
+
 def _spark(sightings: Sightings, frame: int) -> str:
     """The residuals of a target's sightings over time."""
     mm = sightings.residual_mm

@@ -19,15 +19,15 @@ COLOUR = {
 """Of targets, by their state."""
 LEFT, RIGHT = (43, 140, 214), (128, 148, 168)
 """Of the two cameras."""
-PLACE = (230, 60, 140)
+PLACE = (164, 48, 168)
 """Of the place where a target is wanted, and of what is selected."""
 
-_RAMP = np.array([(13, 148, 136), (120, 168, 128), (222, 168, 60), (232, 105, 20)], dtype=float)
+_RAMP = np.array([(43, 140, 214), (226, 164, 46), (224, 90, 10)], dtype=float)
 _SIDES = 16
 
 
 def residual_colours(residual_mm: Float[np.ndarray, "n"], worst_mm: float) -> UInt8[np.ndarray, "n 3"]:
-    """From teal, nothing, to orange, ``worst_mm`` or more; grey where it is not known."""
+    """From blue, nothing, to orange, ``worst_mm`` or more; grey where it is not known."""
     at = np.clip(np.nan_to_num(residual_mm) / max(worst_mm, 1e-9), 0, 1) * (len(_RAMP) - 1)
     rgb = np.stack([np.interp(at, np.arange(len(_RAMP)), _RAMP[:, channel]) for channel in range(3)], axis=1)
     rgb[np.isnan(residual_mm)] = COLOUR[TargetState.provisional]

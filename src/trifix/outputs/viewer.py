@@ -11,7 +11,7 @@ import socket
 import threading
 import time
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import redirect_stdout
 from dataclasses import replace
 from pathlib import Path as FilePath
@@ -24,6 +24,8 @@ from trifix.errors import ViewerError
 from trifix.geometry.camera import Camera, StereoRig
 from trifix.geometry.pose import Pose
 from trifix.outputs import panels
+from trifix.outputs.advice import advice_for_run
+from trifix.outputs.course import object_axes
 from trifix.outputs.finished import FinishedRun, Sightings, recording_beside
 from trifix.outputs.moments import SHOWN_PX, Moment, drawn, moment_of
 from trifix.outputs.scene3d import (
@@ -39,6 +41,7 @@ from trifix.outputs.scene3d import (
     disc,
     ellipsoids,
     facing_wxyz,
+    quaternions_wxyz,
     residual_colours,
     ring,
     worst_shown_mm,
@@ -53,6 +56,7 @@ except ImportError as error:
 _UNIT = 1e-3  # the scene is drawn in metres
 _PAUSE_S = 0.08  # between two drawings
 _LAST_FRAMES = 300  # shown of a live run
+_OUTGROWN = 1.25  # the scene by so much what was looked at: look again
 _NEARLY_RAD = 0.012  # a click so near a target is meant for it
 _PLAY_FRAMES_PER_S = 10.0
 _MAGNIFICATIONS = (0.0, *(step * 10.0**power for power in range(5) for step in (1.0, 2.0, 5.0)), 1e5)
@@ -117,10 +121,9 @@ class Viewer:
         self._arrivals: deque[float] = deque(maxlen=30)
         self._page = _Page(host, port, title)
         self._painter = _Painter(self._paint)
-        self._page.add_live_strip()
+        self._page.timeline("The newest frames")
         self._page.add_view(self._painter.wake)
         self._page.on_watched(self._painter.wake)
-        self._page.say_nothing_yet()
         self._painter.start()
 
     @property
@@ -186,8 +189,8 @@ class RunViewer:
         """
         self._run = run
         self._k, self._target = 0, -1
-        self._worst_mm = worst_shown_mm(run.residual_mm)
-        self._choices = panels.reasons_found(run.reason, run.is_positioned)
+        self._worst_mm = worst_shown_mm(run.course.residual_mm)
+        self._choices = panels.reasons_found(run.reason, run.course.is_positioned)
         self._is_playing = threading.Event()
         self._is_closed = threading.Event()
         self._page = _Page(host, port, run.name)
@@ -198,12 +201,15 @@ class RunViewer:
         self._page.add_view(self._painter.wake)
         self._page.on_watched(self._painter.wake)
         self._page.on_target_clicked(self.select)
+        advice = advice_for_run(run.reason, run.course.points, run.poses, run.targets)
+        self._page.gui.add_html(panels.next_run([each.sentence for each in advice]))
         path = Path()
-        for pose, residual_mm in zip(run.poses, run.residual_mm, strict=True):
+        for pose, residual_mm in zip(run.poses, run.course.residual_mm, strict=True):
             if pose is None:
                 path.break_off()
             else:
                 path.add(pose.t_mm, float(residual_mm))
+        self._page.turn_upright(object_axes(run.course, run.targets))
         self._page.draw_targets(run.targets, self._worst_mm)
         self._page.draw_path(*path.segments(), self._worst_mm)
         self._painter.start()
@@ -284,7 +290,9 @@ class RunViewer:
     def _filter(self, words: str) -> None:
         """Jumps go to these frames from now on."""
         self._meant = self._choices[words]
-        self._strip = panels.strip(self._run.is_positioned, self._run.residual_mm, self._meant, self._worst_mm)
+        self._strip = panels.strip(
+            self._run.course.is_positioned, self._run.course.residual_mm, self._meant, self._worst_mm
+        )
 
     def _play(self) -> None:
         while not self._is_closed.is_set():
@@ -298,7 +306,7 @@ class RunViewer:
         run, k = self._run, self._k
         moment = run.moment(k)
         self._page.draw(moment, run.frames_per_s, run.latency_ms(k), 0)
-        words = panels.frame_words(run.frame, k, run.is_finished)
+        words = panels.frame_words(run.course.frame, k, run.is_finished)
         self._page.draw_strip(panels.with_now(self._strip, k, words))
         if self._target >= 0:
             sightings = run.sightings(self._target)
@@ -400,7 +408,12 @@ class _Page:
         self._is_dark = False
         self._targets = ReferenceMap.empty()
         self._extent_mm = 0.0
-        self._is_framed = False
+        self._is_magnification_chosen = False
+        self._hidden: set[str] = set()
+        self._path_mm = np.zeros((0, 3))
+        self._eye = self._middle = np.zeros(3)
+        self._framed_mm = 0.0
+        self._axes = np.eye(3)
         self._worst_mm = 1.0
         self._clicked: Callable[[int], None] = lambda _: None
         self._theme()
@@ -433,23 +446,24 @@ class _Page:
         self._clicked = clicked
         self._scene.on_click()(self._click)
 
+    def turn_upright(self, axes: Float[np.ndarray, "3 3"]) -> None:
+        """Stand the object on its feet: its right, down and away are rows; until then, as the first frame saw it."""
+        self._axes = axes
+        self._scene.set_up_direction(-axes[1])
+
     def close(self) -> None:
         """Take it away."""
         with redirect_stdout(io.StringIO()):
             self._server.stop()
 
-    def timeline(self) -> viser.GuiTabHandle:
+    def timeline(self, title: str = "Timeline") -> viser.GuiTabHandle:
         """The window below the scene; what is added within it goes there."""
         panel = self.gui.add_panel()
-        tab = panel.add_tab("Timeline")
+        tab = panel.add_tab(title)
         with tab:
             self._strip = self.gui.add_html("")
         panel.float(x=14, y=-14, width=652)
         return tab
-
-    def add_live_strip(self) -> None:
-        """The newest frames instead of a timeline."""
-        self.timeline()
 
     def add_view(self, wake: Callable[[], None]) -> None:
         """What can be chosen about the drawing."""
@@ -470,8 +484,8 @@ class _Page:
             fit = self.gui.add_button("Look at everything")
 
         @self._magnify.on_update
-        def _(_: object) -> None:
-            self._is_magnification_chosen = True
+        def _(event: viser.GuiEvent[viser.GuiDropdownHandle[str]]) -> None:
+            self._is_magnification_chosen |= event.client is not None  # none is told of what the program sets itself
             self._draw_ellipsoids()
 
         @dark.on_update
@@ -483,13 +497,7 @@ class _Page:
         @fit.on_click
         def _(event: viser.GuiEvent[viser.GuiButtonHandle]) -> None:
             if event.client is not None:
-                event.client.camera.position, event.client.camera.look_at = self._overview()
-
-        self._is_magnification_chosen = False
-
-    def say_nothing_yet(self) -> None:
-        """Before the first frame."""
-        self._dots_legend.content = ""
+                self._frame_scene([event.client])
 
     def draw(self, moment: Moment, frames_per_s: float, latency_ms: float, dropped: int) -> None:
         """Show one frame."""
@@ -541,8 +549,13 @@ class _Page:
             self._path_points.colors = residual_colours(of_points_mm, worst_mm)
             self._path_points.point_size = max(0.002 * self._extent_mm, 0.5) * _UNIT
         self._worst_mm = worst_mm
-        if not self._is_framed and len(points_mm) and len(self._targets):
-            self._frame_scene(points_mm)
+        self._path_mm = points_mm
+        if len(points_mm) and len(self._targets):
+            reach_mm = self._extent_mm + float(np.linalg.norm(np.ptp(points_mm, axis=0)))
+            if reach_mm > _OUTGROWN * self._framed_mm:
+                is_first, self._framed_mm = not self._framed_mm, reach_mm
+                eyes = [(each, each.camera.position) for each in self._server.get_clients().values()]
+                self._frame_scene([each for each, at in eyes if is_first or np.allclose(at, self._eye, atol=1e-3)])
 
     def draw_selected(
         self, target: int, from_mm: Float[np.ndarray, "s 3"], residual_mm: Float[np.ndarray, "s"]
@@ -628,13 +641,11 @@ class _Page:
 
         @switch.on_update
         def _(_: object) -> None:
-            self._hidden = {*self._hidden, *nodes} if not switch.value else self._hidden - set(nodes)
+            self._hidden = self._hidden - set(nodes) if switch.value else self._hidden | set(nodes)
             for node in nodes:
                 handle = self._scene.get_handle_by_name(node)
                 if handle is not None:
                     handle.visible = switch.value
-
-    _hidden: frozenset[str] | set[str] = frozenset()
 
     def _click(self, event: viser.SceneClickEvent) -> None:
         """Choose the target nearest to the ray, if there is one."""
@@ -720,16 +731,12 @@ class _Page:
             self._place.position = self._place_label.position = place * _UNIT
             self._place.scale = 1.6 * self._radius_mm * _UNIT
 
-    def _overview(self) -> tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3"]]:
-        """A place for the eye, and what it looks at (m)."""
-        return self._eye, self._middle
+    def _frame_scene(self, clients: Sequence[viser.ClientHandle]) -> None:
+        """Look at targets and path over the sensor's shoulder, above the timeline, and put the grid below them.
 
-    _eye: np.ndarray = np.array([1.0, -1.0, -1.0])
-    _middle: np.ndarray = np.zeros(3)
-
-    def _frame_scene(self, path_mm: Float[np.ndarray, "n 3"]) -> None:
-        """Look at targets and path over the sensor's shoulder, above the timeline, and put the grid below them."""
-        self._is_framed = True
+        Browsers that come later do so too; of those that are there, the ones named.
+        """
+        path_mm = self._path_mm
         targets = self._targets.xyz_mm[self._targets.state == TargetState.trusted]
         targets = targets if len(targets) > 2 else self._targets.xyz_mm
         middle = targets.mean(axis=0)
@@ -737,9 +744,9 @@ class _Page:
         if np.linalg.norm(back) < 0.5 * self._extent_mm:  # all around it
             back = path_mm[0] - middle
         back = back / max(float(np.linalg.norm(back)), 1e-9)
-        towards = back + 0.8 * np.cross(back, [0.0, 1.0, 0.0]) + np.array([0.0, -0.6, 0.0])
+        towards = back + 0.8 * np.cross(back, self._axes[1]) - 0.6 * self._axes[1]
         towards /= np.linalg.norm(towards)
-        right = np.cross([0.0, 1.0, 0.0], towards)
+        right = np.cross(self._axes[1], towards)
         right /= np.linalg.norm(right)
         down = np.cross(towards, right)
         shown = np.concatenate([targets, path_mm + 0.1 * self._extent_mm * back, path_mm])
@@ -752,13 +759,15 @@ class _Page:
         self._eye = self._middle + distance * towards * _UNIT
         camera = self._server.initial_camera
         camera.position, camera.look_at = self._eye, self._middle
-        for client in self._server.get_clients().values():
+        for client in clients:
             client.camera.position, client.camera.look_at = self._eye, self._middle
-        self._grid.position = np.array([0.0, shown[:, 1].max() + 0.15 * self._extent_mm, 0.0]) * _UNIT
+        below = float(((shown - middle) @ self._axes[1]).max()) + 0.15 * self._extent_mm
+        self._grid.position = (middle + below * self._axes[1]) * _UNIT
+        self._grid.wxyz = quaternions_wxyz(self._axes.T[None])[0]
         self._grid.cell_size = _round_mm(self._extent_mm / 4) * _UNIT
         self._grid.section_size = 5 * self._grid.cell_size
         self._grid.fade_distance = 4 * distance * _UNIT
-        self._grid.visible = True
+        self._grid.visible = "/grid" not in self._hidden
 
 
 def _metres(mm: Float[np.ndarray, "*shape"]) -> Float32[np.ndarray, "*shape"]:
