@@ -438,3 +438,127 @@ def rows(path: Path, *columns: str) -> list[tuple[str, ...]]:
     table = list(csv.DictReader(text.splitlines()))
     assert all(None not in row and None not in row.values() for row in table)
     return [tuple(row[column] for column in columns) for row in table]
+
+
+# --- the adjustment --------------------------------------------------------------------------------------------------
+
+RESULTS = ("poses.csv", "trajectory.tum", "map.csv", "frames.csv", "sightings.csv")
+
+
+def bytes_of(folder: Path) -> dict[str, bytes]:
+    return {name: (folder / name).read_bytes() for name in RESULTS}
+
+
+@pytest.fixture(scope="module")
+def unadjusted(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    out = tmp_path_factory.mktemp("unadjusted") / "results"
+    done = trifix("run", SMALL / "recording", "-o", out, "--no-adjust")
+    assert done.code == 0, done.stderr
+    return out
+
+
+def test_a_run_ends_with_an_adjustment_and_says_so(room: Path, unadjusted: Path) -> None:
+    told = json.loads((room / "results" / "summary.json").read_text())["adjustment"]
+    assert told["rms_after"] < told["rms_before"]
+    assert told["observations"] > 100
+    assert "adjusted, rms" in (room / "printed.txt").read_text(encoding="utf-8")
+    assert "All adjusted together" in (room / "results" / "report.html").read_text(encoding="utf-8")
+    assert json.loads((unadjusted / "summary.json").read_text())["adjustment"] is None
+    assert bytes_of(unadjusted)["poses.csv"] != bytes_of(room / "results")["poses.csv"]
+    status = [{row["frame"]: row["status"] for row in frames_in(out)} for out in (unadjusted, room / "results")]
+    assert status[0] == status[1]
+
+
+def frames_in(out: Path) -> list[dict[str, str]]:
+    with (out / "frames.csv").open(newline="") as file:
+        return list(csv.DictReader(file))
+
+
+def test_an_interrupt_while_adjusting_leaves_the_results_before_it_whole(
+    unadjusted: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from trifix import bundle
+
+    def interrupted(*_: object, **__: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(bundle, "adjust", interrupted)
+    done = trifix("run", SMALL / "recording", "-o", tmp_path / "out")
+    assert done.code == 130
+    assert bytes_of(tmp_path / "out") == bytes_of(unadjusted)
+    summary = json.loads((tmp_path / "out" / "summary.json").read_text())
+    assert not summary["finished"]
+    assert summary["frames"] == len(frames_in(unadjusted))
+
+
+def test_where_nothing_can_be_adjusted_the_run_is_complete_and_says_why(
+    unadjusted: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from trifix import bundle
+
+    monkeypatch.setattr(bundle, "MOST_TARGETS", 2)
+    done = trifix("run", SMALL / "recording", "-o", tmp_path / "out")
+    assert done.code == 0
+    assert "not adjusted" in done.stdout
+    assert bytes_of(tmp_path / "out") == bytes_of(unadjusted)
+    summary = json.loads((tmp_path / "out" / "summary.json").read_text())
+    assert summary["finished"]
+    assert "the limit is 2" in summary["not_adjusted"]
+
+
+def test_a_scale_bar_of_an_unknown_target_is_told_when_the_results_are_whole(unadjusted: Path, tmp_path: Path) -> None:
+    bars = tmp_path / "bars.csv"
+    bars.write_text("target_a,target_b,length_mm,sigma_mm\n0,4711,100,0.1\n")
+    done = trifix("run", SMALL / "recording", "-o", tmp_path / "out", "--scale-bars", bars)
+    assert done.code == 1
+    assert done.stderr.splitlines()[-1].endswith("target 4711 is not in the map: name targets by the id of map.csv.")
+    assert bytes_of(tmp_path / "out") == bytes_of(unadjusted)
+    assert json.loads((tmp_path / "out" / "summary.json").read_text())["finished"]
+
+
+def test_control_targets_and_scale_bars_of_an_earlier_run_hold(room: Path, tmp_path: Path) -> None:
+    with (room / "results" / "map.csv").open(newline="") as file:
+        targets = [row for row in csv.DictReader(file) if row["state"] == "trusted"][:5]
+    control = tmp_path / "control.csv"
+    shifted = "\n".join(f"{t['id']},{float(t['x_mm']) + 1000},{t['y_mm']},{t['z_mm']},0.05" for t in targets)
+    control.write_text(f"id,x_mm,y_mm,z_mm,sigma_mm\n{shifted}\n")
+    done = trifix("run", SMALL / "recording", "-o", tmp_path / "out", "--control", control)
+    assert done.code == 0, done.stderr
+    with (tmp_path / "out" / "map.csv").open(newline="") as file:
+        places = {row["id"]: float(row["x_mm"]) for row in csv.DictReader(file)}
+    for t in targets:
+        assert abs(places[t["id"]] - float(t["x_mm"]) - 1000) < 0.2
+
+
+def test_a_refined_rig_is_a_calibration_again(tmp_path: Path) -> None:
+    from trifix.files.calibrations import read_rig
+
+    done = trifix("run", SMALL / "recording", "-o", tmp_path / "out", "--refine-rig")
+    assert done.code == 0, done.stderr
+    assert "rig, moved by" in done.stdout
+    given, refined = (read_rig(folder / "calibration.yaml") for folder in (SMALL / "recording", tmp_path / "out"))
+    assert refined.left.fu_px != given.left.fu_px
+    assert abs(refined.baseline_mm - given.baseline_mm) < 1e-6
+    assert trifix("run", SMALL / "recording", "-o", tmp_path / "out", "--no-adjust").code == 0
+    assert not (tmp_path / "out" / "calibration.yaml").exists()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "text"),
+    [
+        (["--online", "--refine-rig"], "--refine-rig needs the adjustment of the whole recording, which was left out."),
+        (["--no-adjust", "--scale-bars", "b.csv"], "--scale-bars needs the adjustment of the whole recording"),
+        (["--map", "m.csv", "--control", "c.csv"], "--map and --control both say what the world is: choose one."),
+    ],
+)
+def test_options_that_contradict_each_other_are_a_usage_error(arguments: list[str], text: str, tmp_path: Path) -> None:
+    done = trifix("run", SMALL / "recording", "-o", tmp_path / "out", *arguments)
+    assert done.code == 2
+    assert text in done.stderr
+
+
+def test_a_rig_is_not_refined_by_points(tmp_path: Path) -> None:
+    assert trifix("simulate", "statue", "-o", tmp_path, "--level", "points", "--frames", 3).code == 0
+    done = trifix("run", tmp_path / "recording", "-o", tmp_path / "out", "--refine-rig")
+    assert done.code == 1
+    assert "has points only: a rig is refined where one saw the dots of all frames." in done.stderr

@@ -1,6 +1,8 @@
+from trifix.bundle import Adjusted, Constraints, NotAdjusted, adjust_steps
 from trifix.config import Config, read_config
 from trifix.errors import TrifixError
 from trifix.evaluation import evaluate
+from trifix.files.constraints import read_control, read_scale_bars
 from trifix.files.maps import read_map
 from trifix.files.recordings import Recording, read_recording
 from trifix.geometry.camera import Camera, StereoRig
@@ -12,6 +14,7 @@ from trifix.records import (
     Dots,
     Fix,
     Frame,
+    KnownLength,
     NoFix,
     Reason,
     ReferenceMap,
@@ -31,12 +34,16 @@ from trifix.stages.update import update
 from trifix.stages.verify import verify
 
 __all__ = [
+    "Adjusted",
     "Camera",
     "Config",
+    "Constraints",
     "Dots",
     "Fix",
     "Frame",
+    "KnownLength",
     "NoFix",
+    "NotAdjusted",
     "Pose",
     "Positioner",
     "Positions",
@@ -52,6 +59,7 @@ __all__ = [
     "StereoMatches",
     "StereoRig",
     "TrifixError",
+    "adjust_steps",
     "correct_eccentricity",
     "detect",
     "evaluate",
@@ -60,8 +68,10 @@ __all__ = [
     "orient",
     "position",
     "read_config",
+    "read_control",
     "read_map",
     "read_recording",
+    "read_scale_bars",
     "simulate",
     "triangulate",
     "update",

@@ -7,13 +7,13 @@ matrix is the joint covariance of the map. Cost grows linearly with the frames a
 Knows neither files nor how the targets were identified; the gauge is the caller's choice.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from trifix.errors import AdjustmentError
+from trifix.errors import AdjustmentError, ConfigError
 from trifix.geometry.alignment import point_jacobian
 from trifix.geometry.camera import Camera, StereoRig
 from trifix.geometry.pose import Pose, skew
@@ -107,6 +107,10 @@ class RigSigmas:
     distortion: float = 0.1
     """Coefficients of distortion."""
 
+    def __post_init__(self) -> None:
+        if min(self.rotation_rad, self.translation_mm, self.focal_px, self.principal_px, self.distortion) <= 0:
+            raise ConfigError("A rig's standard deviations must all be positive.")
+
 
 @dataclass(frozen=True, slots=True)
 class AdjustOptions:
@@ -120,6 +124,12 @@ class AdjustOptions:
     """Poses and targets whose standard deviation would exceed their distance (or a radian) over this are left out."""
     most_steps: int = 60
     """Steps after which the search for the minimum is given up."""
+
+    def __post_init__(self) -> None:
+        if not 0 < self.doubt_sigmas < self.reject_sigmas:
+            raise ConfigError("doubt_sigmas must be positive, and reject_sigmas larger.")
+        if self.least_firmness <= 0 or self.most_steps < 1:
+            raise ConfigError("least_firmness must be positive, and most_steps at least 1.")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -143,6 +153,8 @@ class Adjustment:
     """The refined rig; None where none was to be refined."""
     rig_parameters: tuple[str, ...]
     """What was refined: δ of T_right_left · exp(δ), then focal lengths, principal points and distortion of both."""
+    rig_change: Float[np.ndarray, "q"]
+    """How far each of these is from the rig that was given."""
     rig_cov: Float[np.ndarray, "q q"]
     """Covariance of these."""
     weight: Float[np.ndarray, "m"]
@@ -171,12 +183,14 @@ def adjust(
     scale_bars: Sequence[ScaleBar] = (),
     refine_rig: RigSigmas | None = None,
     options: AdjustOptions = AdjustOptions(),
+    watch: Callable[[], None] | None = None,
 ) -> Adjustment:
     """Poses and targets of the least robust residuals, begun from the given ones.
 
     ``rig`` is needed for dots: one for all frames, or one a frame. ``gauge`` says what the world is: the frame whose
     pose stays as it is, or targets known beforehand. With ``refine_rig`` the two cameras and their relative pose are
-    unknowns too; the baseline keeps its length unless scale bars or known targets tell another.
+    unknowns too; the baseline keeps its length unless scale bars or known targets tell another. ``watch`` is called
+    before every step, and may raise to end the search.
 
     Levenberg-Marquardt, which is Gauss-Newton wherever that descends, on iteratively reweighted residuals: Huber's
     loss until the minimum is near, then Hampel's in three parts, for which outliers count nothing.
@@ -192,7 +206,7 @@ def adjust(
         network.rigs,
     )
     search = _Search(network, options, start)
-    search.run()
+    search.run(watch)
     return search.result(T_world_sensor)
 
 
@@ -446,6 +460,14 @@ class _RigUnknowns:
         right = _intrinsics(rig.right) - _intrinsics(self.given.right)
         return np.concatenate([delta, left, right]) / self.sigma, J / self.sigma[:, None]
 
+    def change(self, rig: StereoRig) -> Float[np.ndarray, "q"]:
+        """How far each unknown is from the given one."""
+        basis = self._basis(self.given)
+        delta = (self.given.T_right_left.inverse() @ rig.T_right_left).log()
+        left = _intrinsics(rig.left) - _intrinsics(self.given.left)
+        right = _intrinsics(rig.right) - _intrinsics(self.given.right)
+        return np.concatenate([basis.T @ delta, left, right])
+
     def jacobian(
         self,
         rig: StereoRig,
@@ -591,7 +613,7 @@ class _Search:
         self.is_active = np.ones(len(network), dtype=bool)
         self.steps = 0
 
-    def run(self) -> None:
+    def run(self, watch: Callable[[], None] | None) -> None:
         """Moves the state to the minimum."""
         r = self.network.residuals(self.state)
         s = np.linalg.norm(r, axis=1)
@@ -601,6 +623,8 @@ class _Search:
         scale, damping, last_sigmas, is_final = np.inf, 0.0, np.inf, False
         while self.steps < self.options.most_steps:
             self.steps += 1
+            if watch is not None:
+                watch()
             if not is_final:
                 scale = max(1.0, min(scale, float(np.median(s[self.is_active])) / self.median))
             loss = self._loss(scale, is_final)
@@ -831,6 +855,7 @@ class _Search:
             is_target_adjusted=self.is_target_in,
             rig=None if network.rig_unknowns is None else state.rigs[0],
             rig_parameters=() if network.rig_unknowns is None else network.rig_unknowns.names,
+            rig_change=np.zeros(0) if network.rig_unknowns is None else network.rig_unknowns.change(state.rigs[0]),
             rig_cov=cov[count:, count:],
             weight=weight,
             chi2=float((self.weight * np.where(used, self.s, 0.0) ** 2).sum()) + self._known_chi2(state),

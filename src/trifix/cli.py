@@ -14,19 +14,19 @@ import stat
 import sys
 import threading
 import tomllib
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Annotated, Literal
 
 from cyclopts import App, CycloptsError, Parameter
-from rich.progress import TaskID
+from rich.progress import Progress, TaskID
 from rich.text import Text
 
 import trifix
 from trifix.console import Json, answer, progress_bar, table_of
-from trifix.errors import MapError, RecordingError, TrifixError
+from trifix.errors import CalibrationError, MapError, RecordingError, TrifixError
 
 app = App(
     name="trifix",
@@ -71,6 +71,10 @@ def run(
     frame_triangles: Literal["auto", "all", "local"] | None = None,
     sigma_px: float | None = None,
     target_diameter_mm: float | None = None,
+    no_adjust: bool = False,
+    refine_rig: bool = False,
+    scale_bars: Path | None = None,
+    control: Path | None = None,
     config: Path | None = None,
     settings: Settings = (),
     json: Json = False,
@@ -94,6 +98,11 @@ def run(
         sigma_px: Standard deviation of a dot's centre to start from, where the recording states none (px); 0.3 unless
             an option says otherwise.
         target_diameter_mm: Diameter of the targets (mm); pairs of dots that are not that large are left out.
+        no_adjust: Leave poses and targets as each frame by itself gave them, not adjusted all together in the end.
+        refine_rig: Adjust the calibration as well, and write it as calibration.yaml.
+        scale_bars: CSV file of known distances, target_a,target_b,length_mm,sigma_mm; the targets' ids are those of the
+            map.csv of an earlier run of the same recording.
+        control: CSV file of targets whose places are known, id,x_mm,y_mm,z_mm; its coordinates become the world's.
         config: TOML file of options; `trifix config` prints one.
         settings: An option by its full name, such as match.max_depth_mm=900; may be repeated.
     """
@@ -112,15 +121,30 @@ def run(
             "match.target_diameter_mm": target_diameter_mm,
             "verify.method": verify,
             "update.method": update,
+            "adjust.adjusts": "false" if no_adjust else None,
+            "adjust.refines_rig": "true" if refine_rig else None,
         },
         is_paper=paper,
     )
+    asked = {"--refine-rig": options.adjust.refines_rig, "--scale-bars": scale_bars, "--control": control}
+    for name in (name for name, value in asked.items() if value and (online or paper or not options.adjust.adjusts)):
+        raise CycloptsError(msg=f"{name} needs the adjustment of the whole recording, which was left out.")
+    if map_ is not None and control is not None:
+        raise CycloptsError(msg="--map and --control both say what the world is: choose one.")
     given = None if map_ is None else trifix.read_map(map_)
     if given is not None and not len(given):
         raise MapError(f"{map_}: found no target, expected at least three; choose another map or none.")
+    constraints = trifix.Constraints(
+        given,
+        control=None if control is None else trifix.read_control(control),
+        lengths=() if scale_bars is None else trifix.read_scale_bars(scale_bars),
+    )
     frames = trifix.read_recording(recording, level, options.noise.sigma_px)
+    if options.adjust.refines_rig and (frames.level == "points" or frames.rigs):
+        what = "points only" if frames.level == "points" else "a rig for each frame"
+        raise CalibrationError(f"{recording} has {what}: a rig is refined where one saw the dots of all frames.")
     is_map_frozen = given is not None and map_mode != "grow"
-    _position(frames, out, options, json, given, is_map_frozen, is_online=online or paper)
+    _position(frames, out, options, json, constraints, is_map_frozen, is_online=online or paper)
 
 
 @app.command(sort_key=1)
@@ -494,16 +518,21 @@ def _position(
     out: Path,
     options: "trifix.Config",
     json: bool,
-    given: "trifix.ReferenceMap | None" = None,
+    constraints: "trifix.Constraints | None" = None,
     is_map_frozen: bool = False,
     is_online: bool = False,
 ) -> None:
     """Judge every frame, write down what was found, and say what it amounts to."""
     from trifix.config import to_toml
+    from trifix.files.calibrations import write_rig
     from trifix.outputs.terminal import summary_table
 
+    given = None if constraints is None else constraints.given
     positioner = trifix.Positioner(options, given, is_map_frozen)
     report = trifix.Report()
+    adjusted: trifix.Adjusted | trifix.NotAdjusted | None = None
+    fault: MapError | None = None
+    final: Sequence[trifix.Step] = ()
     with (
         trifix.ResultsWriter(
             out, recording.path.resolve().name, recording.level, to_toml(options), is_online
@@ -524,15 +553,55 @@ def _position(
                     judged.append(step.remembered())
             if not is_online:
                 results.start_over()
-                again = zip(recording, positioner.revise(judged), strict=True)
-                for frame, step in progress.track(again, len(recording), description="revising"):
+                revised = list[trifix.Step]()
+                for step in progress.track(positioner.revise(judged), len(recording), description="revising"):
                     results.write(step)
-                    report.show(replace(step, frame=frame))  # with its images
+                    revised.append(replace(step, identification=None))
                     stop_if_told()
-        summary = results.finish()
+                final = revised
+                if options.adjust.adjusts:
+                    results.start_over()  # what has been found stands, whatever becomes of the adjustment
+                    known = options, constraints or trifix.Constraints(), recording.is_noise_stated
+                    final, adjusted, fault = _adjusted(revised, *known, progress, stop_if_told)
+                    for step in final:
+                        results.write(step)
+                again = zip(recording, final, strict=True)
+                for frame, step in progress.track(again, len(recording), description="reporting"):
+                    report.show(replace(step, frame=replace(frame, rig=step.frame.rig)))  # with its images
+                    stop_if_told()
+        summary = results.finish(adjusted)
+    rig = final[0].frame.rig if final else None
+    if rig is not None and isinstance(adjusted, trifix.Adjusted) and adjusted.rig_change:
+        write_rig(rig, out / "calibration.yaml")
     page = out / "report.html"
     report.write(page, summary)
     answer({**asdict(summary), "report": page}, json, lambda: summary_table(summary, page))
+    if fault is not None:
+        raise fault
+
+
+def _adjusted(
+    steps: "Sequence[trifix.Step]",
+    options: "trifix.Config",
+    constraints: "trifix.Constraints",
+    is_noise_stated: bool,
+    progress: Progress,
+    stop_if_told: Callable[[], None],
+) -> "tuple[Sequence[trifix.Step], trifix.Adjusted | trifix.NotAdjusted, MapError | None]":
+    """The steps adjusted together, what came of it, and the fault in what was given that is told when all is done."""
+    task = progress.add_task("adjusting", total=None, unit="steps")
+
+    def watch() -> None:
+        progress.advance(task)
+        stop_if_told()
+
+    try:
+        final, adjusted = trifix.adjust_steps(steps, options, constraints, is_noise_stated=is_noise_stated, watch=watch)
+        fault = None
+    except MapError as error:
+        final, adjusted, fault = steps, trifix.NotAdjusted(str(error)), error
+    progress.update(task, total=progress.tasks[task].completed)
+    return final, adjusted, fault
 
 
 @contextmanager

@@ -19,6 +19,7 @@ from typing import ClassVar, Literal, Protocol, TypeVar, get_args, get_origin, g
 
 import msgspec
 
+from trifix.adjustment import AdjustOptions, RigSigmas
 from trifix.errors import ConfigError
 from trifix.files.tables import read_text
 from trifix.stages.detect import DetectOptions
@@ -58,6 +59,20 @@ class IslandOptions:
 
 
 @dataclass(frozen=True, slots=True)
+class BundleOptions:
+    """What is adjusted together once the whole recording is known."""
+
+    adjusts: bool = True
+    """Adjust all poses and targets together; otherwise they stay as each frame by itself gave them."""
+    refines_rig: bool = False
+    """Adjust the cameras' relative pose, focal lengths, principal points and distortion as well."""
+    search: AdjustOptions = field(default_factory=AdjustOptions)
+    """How observations are weighed, and when to stop."""
+    rig: RigSigmas = field(default_factory=RigSigmas)
+    """How far the calibration may be off, where it is refined."""
+
+
+@dataclass(frozen=True, slots=True)
 class Config:
     """Every stage's options, in the order of the work."""
 
@@ -81,6 +96,8 @@ class Config:
     """How the map is kept clean."""
     islands: IslandOptions = field(default_factory=IslandOptions)
     """What becomes of frames that nothing connects to the map."""
+    adjust: BundleOptions = field(default_factory=BundleOptions)
+    """What is adjusted together once the whole recording is known."""
 
 
 def read_config(path: Path | str) -> Config:
@@ -117,6 +134,7 @@ def paper_options(technique: Technique = "frequency") -> Config:
         update=UpdateOptions(method="kalman", max_misses=0),
         tend=TendOptions(tends=False),
         islands=IslandOptions(max_islands=0),
+        adjust=BundleOptions(adjusts=False),
     )
 
 

@@ -65,7 +65,8 @@ class _Rate(ProgressColumn):
         self._unit = unit
 
     def render(self, task: Task) -> Text:
-        return Text(f"{task.completed / task.elapsed:.1f} {self._unit}/s" if task.elapsed else "")
+        unit = task.fields.get("unit", self._unit)
+        return Text(f"{task.completed / task.elapsed:.1f} {unit}/s" if task.elapsed else "")
 
 
 def progress_bar(unit: str = "frames") -> Progress:

@@ -13,6 +13,7 @@ from typing import assert_never
 import numpy as np
 from jaxtyping import Int
 
+from trifix.bundle import Adjusted, Constraints, NotAdjusted, adjust_steps
 from trifix.config import Config
 from trifix.doors import checked_map, in_order, with_usable_points
 from trifix.errors import MapError
@@ -436,6 +437,8 @@ class Positions:
     """The targets, as known in the end."""
     noise_scale: float
     """Factor on all standard deviations that the recording turned out to need."""
+    adjusted: Adjusted | NotAdjusted
+    """What adjusting everything together did, or why nothing was adjusted."""
 
 
 def position(
@@ -444,7 +447,7 @@ def position(
     map: ReferenceMap | None = None,
     is_map_frozen: bool = False,
 ) -> Positions:
-    """Every frame of a recording positioned by all that the whole recording tells, in one call.
+    """Every frame of a recording positioned by all that the whole recording tells, adjusted together, in one call.
 
     Raises:
         TrifixError: the recording cannot be read.
@@ -453,8 +456,14 @@ def position(
     if not isinstance(recording, Recording):
         recording = read_recording(Path(recording), sigma_px=positioner.config.noise.sigma_px)
     steps = [step.remembered() for step in positioner.run(recording)]
-    fixes = tuple(step.fix for step in positioner.revise(steps))
-    return Positions(recording.index, recording.timestamp_ns, fixes, positioner.map.copy(), positioner.noise.scale)
+    revised = [replace(step, identification=None) for step in positioner.revise(steps)]
+    final, adjusted = adjust_steps(
+        revised, positioner.config, Constraints(map), is_noise_stated=recording.is_noise_stated
+    )
+    fixes = tuple(step.fix for step in final)
+    targets = final[-1].map.copy() if final else positioner.map.copy()
+    scale = final[-1].noise_scale if final else positioner.noise.scale
+    return Positions(recording.index, recording.timestamp_ns, fixes, targets, scale, adjusted)
 
 
 def _labelled_dots(image: GreyOrColour, options: DetectOptions) -> Dots:

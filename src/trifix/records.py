@@ -264,6 +264,22 @@ class ReferenceMap:
         )
 
 
+@dataclass(frozen=True, slots=True)
+class KnownLength:
+    """The distance of two targets, measured by other means."""
+
+    target_a: int
+    """Identity of one target."""
+    target_b: int
+    """Identity of the other."""
+    length_mm: float
+    """Their distance (mm)."""
+    sigma_mm: float
+    """Its standard deviation (mm)."""
+    source: str = "scale bar"
+    """Where it was said, for complaints."""
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Identification:
     """h hypotheses, likeliest first, each saying of c points which targets they are."""

@@ -45,13 +45,9 @@ def read_map(path: Path | str) -> ReferenceMap:
         dict.fromkeys((*COVARIANCE, *_VIEW), float) | {"sightings": int, "state": str},
         error=MapError,
     )
-    identity, line = table["id"], table[LINE]
+    identity = table["id"]
     refuse_where((identity < 0) | (identity > _LARGEST_ID), path, table, "id", f"0 to {_LARGEST_ID}", MapError)
-    first, count = np.unique(identity, return_index=True, return_counts=True)[1:]
-    if (count > 1).any():
-        twice = identity[first[int((count > 1).argmax())]]
-        lines = line[identity == twice]
-        raise MapError(f"{path}, line {lines[1]}: id {twice} already stands in line {lines[0]}, expected it once.")
+    refuse_twice(path, table)
     xyz = np.stack([table[name] for name in _XYZ], axis=1)
     across = float(np.linalg.norm(np.ptp(xyz, axis=0))) if len(xyz) >= 3 else np.inf
     if across < _LEAST_ACROSS_MM:
@@ -61,7 +57,7 @@ def read_map(path: Path | str) -> ReferenceMap:
         )
     return ReferenceMap.given(
         xyz_mm=xyz,
-        cov_mm2=_covariances(path, table),
+        cov_mm2=covariances(path, table),
         view=_views(path, table),
         id=identity,
         sightings=table.get("sightings", np.zeros(len(identity), dtype=np.int64)).clip(min=0),
@@ -97,7 +93,21 @@ def write_ply(map: ReferenceMap, path: Path) -> None:
     write_atomically(path, "\n".join([*header, *rows]) + "\n")
 
 
-def _covariances(path: Path, table: Table) -> Float[np.ndarray, "k 3 3"]:
+def refuse_twice(path: Path, table: Table) -> None:
+    """Refuses a table that names a target twice.
+
+    Raises:
+        MapError: with both lines.
+    """
+    identity = table["id"]
+    first, count = np.unique(identity, return_index=True, return_counts=True)[1:]
+    if (count > 1).any():
+        twice = identity[first[int((count > 1).argmax())]]
+        lines = table[LINE][identity == twice]
+        raise MapError(f"{path}, line {lines[1]}: id {twice} already stands in line {lines[0]}, expected it once.")
+
+
+def covariances(path: Path, table: Table) -> Float[np.ndarray, "k 3 3"]:
     """Covariances (mm²), zero where all six cells are empty."""
     entries = _group(path, table, COVARIANCE)
     cov = from_upper_triangle(np.nan_to_num(entries))

@@ -1,6 +1,6 @@
 """The results folder, written as Steps pass and usable whenever the process dies. Decides nothing, draws nothing.
 
-A recording may be gone through twice. What the first passage gave stands until the second, written beside it in a
+A recording may be gone through several times. What one passage gave stands until the next, written beside it in a
 hidden folder, is whole and takes its place.
 
 Rows wait in memory for a quarter of a second at most; then a thread appends them to their files in blocks of whole
@@ -22,6 +22,7 @@ import msgspec
 import numpy as np
 from jaxtyping import Float
 
+from trifix.bundle import Adjusted, NotAdjusted
 from trifix.config import Config, with_values
 from trifix.errors import RecordingError
 from trifix.files.maps import write_map, write_ply
@@ -63,7 +64,7 @@ class ResultsWriter:
         results.start_over()                        # not for a live run
         for step in positioner.revise(steps):
             results.write(step)
-        summary = results.finish()
+        summary = results.finish()                  # or start over once more, with adjusted steps
 
     Without ``finish``, as after an exception, the files are closed whole and the summary says ``finished: false``.
     """
@@ -79,6 +80,7 @@ class ResultsWriter:
         self._dots_written = 0
         self._waiting: list[dict[str, list[str]]] = []
         self._is_finished = False
+        self._adjusted: Adjusted | NotAdjusted | None = None
         self._failure: OSError | None = None
         self._lock = threading.Lock()  # held for moments: between the loop, which fills, and the thread, which empties
         self._files = threading.Lock()  # held while files are written or exchanged
@@ -96,7 +98,7 @@ class ResultsWriter:
             _make_folder(self._out)
             self._start = time.monotonic()
             self._write_state()  # first of all: from here on the summary says that the run is not finished
-            for name in (*_HEADERS, "report.html"):
+            for name in (*_HEADERS, "calibration.yaml", "report.html"):
                 (self._out / name).unlink(missing_ok=True)
             for name in (_ISLANDS, _REVISED):
                 shutil.rmtree(self._out / name, ignore_errors=True)
@@ -149,7 +151,9 @@ class ResultsWriter:
             self._tally.add(step, residual_px)
 
     def start_over(self) -> None:
-        """Begin again with the first frame; what has been written stands until ``finish`` puts the new in its place.
+        """Begin again with the first frame; what has been written stands until the new is whole and takes its place.
+
+        That is when ``finish`` is called, or this once more.
 
         Raises:
             RecordingError: the files cannot be written.
@@ -158,8 +162,8 @@ class ResultsWriter:
         try:
             with self._files:
                 self._flush()
-                for log in self._logs.values():
-                    log.close()
+                self._publish()
+                self._write_state()
                 self._folder = self._out / _REVISED
                 self._folder.mkdir()
                 self._logs = self._open_logs()
@@ -175,14 +179,14 @@ class ResultsWriter:
         """What seems to be wrong with the rig so far; empty if nothing does."""
         return self._rig_check.sentence
 
-    def finish(self) -> Summary:
-        """Close the files of a run that reached its end; what it amounts to.
+    def finish(self, adjusted: Adjusted | NotAdjusted | None = None) -> Summary:
+        """Close the files of a run that reached its end; what it amounts to, and its adjustment if there was one.
 
         Raises:
             RecordingError: something could not be written.
         """
         self._rig_check.finish()
-        self._is_finished = True
+        self._is_finished, self._adjusted = True, adjusted
         self._close()
         self._complain()
         return self._summary
@@ -247,6 +251,9 @@ class ResultsWriter:
         self._folder = self._out
 
     def _write_state(self) -> None:
+        """Map and summary of what stands; those of a passage that is not whole yet wait for it."""
+        if self._folder != self._out:
+            return
         with self._lock:
             targets, islands = self._map, dict(self._island_maps)
             self._summary = self._tally.summary(
@@ -254,6 +261,7 @@ class ResultsWriter:
                 time.monotonic() - self._start,
                 finished=self._is_finished and self._closing.is_set(),
                 rig=self._rig_check.sentence,
+                adjusted=self._adjusted,
             )
         for number, there in islands.items():
             folder = self._folder / _ISLANDS / str(number)

@@ -10,6 +10,7 @@ from importlib.metadata import version
 import numpy as np
 from jaxtyping import Float
 
+from trifix.bundle import Adjusted, NotAdjusted
 from trifix.geometry.pose import Pose
 from trifix.outputs.advice import advice_for_run
 from trifix.records import Fix, NoFix, ReferenceMap, Step, TargetState
@@ -97,6 +98,10 @@ class Summary:
     """Of trifix and of what its numbers depend on."""
     advice: tuple[Tip, ...] = ()
     """What the refusals of a finished run suggest, the most rewarding first."""
+    adjustment: Adjusted | None = None
+    """What came of adjusting everything together; None where nothing was adjusted."""
+    not_adjusted: str = ""
+    """Why nothing was adjusted, in a sentence, if it should have been."""
 
 
 class Tally:
@@ -130,8 +135,15 @@ class Tally:
             self._timings_ms[stage].append(ms)
         self._noise_scale = step.noise_scale
 
-    def summary(self, targets: ReferenceMap, seconds: float, finished: bool, rig: str = "") -> Summary:
-        """The numbers so far, with the map as it now is, and what is wrong with the rig."""
+    def summary(
+        self,
+        targets: ReferenceMap,
+        seconds: float,
+        finished: bool,
+        rig: str = "",
+        adjusted: Adjusted | NotAdjusted | None = None,
+    ) -> Summary:
+        """The numbers so far, with the map as it now is, what is wrong with the rig and what came of the adjustment."""
         return Summary(
             recording=self._recording,
             level=self._level,
@@ -159,6 +171,8 @@ class Tally:
             options=self._options,
             versions=versions(),
             advice=self._advice(targets) if finished else (),
+            adjustment=adjusted if isinstance(adjusted, Adjusted) else None,
+            not_adjusted=adjusted.why if isinstance(adjusted, NotAdjusted) else "",
         )
 
     def _advice(self, targets: ReferenceMap) -> tuple[Tip, ...]:

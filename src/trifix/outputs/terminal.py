@@ -28,6 +28,13 @@ def summary_table(summary: Summary, report: Path) -> Group:
         if residuals.rms is not None:
             table.add_row("residual, rms", f"{residuals.rms:.3f}", f"{unit}  worst frame {residuals.worst:.3f}")
     table.add_row("noise", f"{summary.noise_scale:.2f}", "times what was stated or assumed")
+    if (a := summary.adjustment) is not None:
+        what = f"{a.unit} of {a.observations} {'dots' if a.unit == 'px' else 'points'}, {a.rms_before:.3f} before"
+        table.add_row("adjusted, rms", f"{a.rms_after:.3f}", f"{what}  {a.seconds:.1f} s")
+        if a.rig_change_sigmas is not None:
+            table.add_row("rig, moved by", f"{a.rig_change_sigmas:.1f}", "standard deviations, rms of its parameters")
+    if summary.not_adjusted:
+        table.add_row("not adjusted", "", Text(summary.not_adjusted, "yellow"))
     if total := summary.timings.get("total"):
         table.add_row("time a frame", f"{total.median_ms:.1f}", f"ms  99 % below {total.p99_ms:.1f}")
     table.add_row("in all", f"{summary.seconds:.1f}", f"s  {summary.frames_per_s:.1f} frames/s")
