@@ -85,7 +85,7 @@ class Adjusted:
     unit: str
     """Of the residuals: px for dots, mm for points."""
     rms_before: float
-    """Root mean square distance of the others from their targets, at the poses and places as they were."""
+    """Root mean square distance of the others from their targets, each by its weight, before the adjustment."""
     rms_after: float
     """The same when adjusted."""
     noise_scale: float
@@ -608,6 +608,8 @@ class _Bundle:
         before = np.linalg.norm(_off(observations, self._seen, T, xyz, self._rigs), axis=1)
         after = np.linalg.norm(_off(observations, self._seen, self._T, self._xyz, self._rigs_now()), axis=1)
         counts = counts & np.isfinite(before) & np.isfinite(after)
+        cov = observations.cov_px2 if isinstance(observations, DotObservations) else observations.cov_mm2
+        information = out.weight / np.trace(cov, axis1=1, axis2=2)
         sigma = np.sqrt(np.diag(out.rig_cov))
         change = None
         if len(sigma):
@@ -620,8 +622,8 @@ class _Bundle:
             dots_found=len(self._seen) - self._identified,
             rejected=int((out.weight == 0).sum()),
             unit="px" if self._has_dots else "mm",
-            rms_before=_rms(before[counts]),
-            rms_after=_rms(after[counts]),
+            rms_before=float(np.sqrt(np.average(before[counts] ** 2, weights=information[counts]))),
+            rms_after=float(np.sqrt(np.average(after[counts] ** 2, weights=information[counts]))),
             noise_scale=self._typical_scale() * self._misfit(),
             noise_growth=self._growth / 2,
             steps=self._count,
@@ -664,7 +666,3 @@ def _by_camera(
 def _in_sensor(seen: _Sightings, T: Sequence[Pose], xyz_mm: Float[np.ndarray, "k 3"]) -> Float[np.ndarray, "m 3"]:
     R, t = np.array([each.R for each in T])[seen.frame], np.array([each.t_mm for each in T])[seen.frame]
     return np.asarray(np.einsum("mji,mj->mi", R, xyz_mm[seen.target] - t))
-
-
-def _rms(values: Float[np.ndarray, "n"]) -> float:
-    return float(np.sqrt((values**2).sum() / max(len(values), 1)))
