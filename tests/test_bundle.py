@@ -406,3 +406,22 @@ def test_targets_that_are_not_trusted_have_no_say_where_others_hold_the_pose(dot
     for pose, other in zip(fixes(doubted).values(), fixes(dots.after).values(), strict=True):
         assert isinstance(pose.T_world_sensor, Pose)
         assert pose.T_world_sensor.distance_mm(other.T_world_sensor) < 0.7
+
+
+def test_dots_that_no_frame_identified_are_found_by_the_adjusted_map(dots: Run) -> None:
+    """All that frames said of single dots is forgotten; the map finds most of it again, and nothing false."""
+
+    def forgetful(step: Step) -> Step:
+        return replace(step, fix=replace(step.fix, single=SingleDots.none())) if isinstance(step.fix, Fix) else step
+
+    steps, told = adjust_steps([forgetful(step) for step in dots.before])
+    assert isinstance(told, Adjusted)
+    before = sum(len(fix.single) for fix in fixes(dots.before).values())
+    assert 0.9 * before < told.dots_found < 1.3 * before
+    for k, fix in fixes(steps).items():
+        known = fixes(dots.after)[k].single
+        said = dict(
+            zip(zip(known.camera.tolist(), known.dot.tolist(), strict=True), known.target.tolist(), strict=True)
+        )
+        for camera, dot, target in zip(fix.single.camera, fix.single.dot, fix.single.target, strict=True):
+            assert said.get((int(camera), int(dot)), target) == target
