@@ -33,6 +33,7 @@ class Case(NamedTuple):
     inside: float
     noise: float
     light_per_px: float = 0.0
+    white: float = np.inf  # grey value at which the camera saturates
 
 
 DARK, BRIGHT, DEEP = (180.0, 30.0, 2.0), (20.0, 200.0, 2.0), (1500.0, 9000.0, 100.0)
@@ -47,6 +48,14 @@ CASES = (
     Case(25, 45, 0.7, *DARK),
     Case(40, 0, 1.0, *BRIGHT),
     Case(40, 60, 0.7, *DARK),
+    Case(6, 45, 2.0, *DARK),
+    Case(20, 60, 2.0, *BRIGHT),
+    Case(25, 45, 0.7, *DARK, 0.003),
+    Case(12, 30, 0.7, 120, 88, 2),
+    Case(12, 30, 0.7, 88, 120, 2),
+    Case(16, 45, 0.9, 20, 300, 2, 0.0, 255),
+    Case(60, 65, 1.0, *DEEP),
+    Case(200, 45, 1.0, *DARK),
 )
 
 
@@ -65,19 +74,46 @@ class Accuracy(NamedTuple):
     """Share of them beyond what 5 % should exceed."""
     below: float
     """Share of them below what 5 % should."""
+    recall: float
+    """Share of dots found in the noise."""
+    axis_bias_px: float
+    """Largest mean error of a semi-axis without noise."""
+    axis_scatter: float
+    """Root mean square deviation of the semi-axes in the noise from their mean, over the bound's."""
+    axis_to_centre: float
+    """Variance of a semi-axis as found, over that of the centre as stated along it."""
 
 
 def main(dots: int = 36, draws: int = 12, images: int = 60) -> None:
     detection.warm_up()
-    table = Table("dots", "bias, px", "worst, px", "scatter / bound", "chi² / 2", "beyond 95 %", "below 5 %")
+    table = Table(
+        "dots",
+        "bias, px",
+        "worst, px",
+        "scatter / bound",
+        "chi² / 2",
+        "beyond 95 %",
+        "below 5 %",
+        "found",
+        *("axes: bias, px", "scatter / bound", "variance / centre's"),
+    )
     for case in CASES:
-        found = accuracy(case, dots, draws)
-        name = f"{case.diameter_px} px, {case.tilt_deg}°, {case.around:.0f} → {case.inside:.0f} ± {case.noise:.0f}"
+        found = accuracy(case, dots if case.diameter_px <= 60 else 4, draws)
+        name = f"{case.diameter_px} px, {case.tilt_deg}°, blur {case.blur_px}"
+        name += f", {case.around:.0f} → {case.inside:.0f} ± {case.noise:.0f}"
+        name += f", light {case.light_per_px}" * (case.light_per_px > 0) + ", saturated" * np.isfinite(case.white)
         table.add_row(name, *(f"{value:.4f}" for value in found[:2]), *(f"{value:.3f}" for value in found[2:]))
     Console().print(table)
     table = Table("images", "dots", "found, %", "false per 100 images", "centre rms, px", "ms")
     for name, count in (("head", images), ("statue", images), ("sizes", images), ("correlated noise", images // 4)):
         table.add_row(name, *searched(name, count))
+    Console().print(table)
+    table = Table(
+        "partly hidden, % accepted (% of these off by more than 3 σ)", *(f"{d} px" for d in (6, 10, 20, 40, 100))
+    )
+    for share in (0.05, 0.1, 0.2, 0.3, 0.5):
+        gone = [hidden(d, share, 40 if d < 100 else 20) for d in (6, 10, 20, 40, 100)]
+        table.add_row(f"{share:.0%}", *(f"{100 * one.accepted:.0f} ({100 * one.beyond:.0f})" for one in gone))
     Console().print(table)
     table = Table("1280 x 1024, 63 dots", "detect, ms", "OpenCV, ms", "ratio")
     for name, (ours, theirs) in timed().items():
@@ -133,33 +169,34 @@ def box_of(u: float, v: float, a: float, blur_px: float, shape: tuple[int, ...])
 def accuracy(case: Case, dots: int, draws: int) -> Accuracy:
     rng = np.random.default_rng(int(case.diameter_px * 100 + case.tilt_deg))
     rows = int(np.sqrt(dots))
-    pitch = int(case.diameter_px + 6 * case.blur_px + 14)
+    pitch = int(case.diameter_px + 6 * case.blur_px + max(14, 0.4 * case.diameter_px))
     size = rows * pitch
     v, u = np.mgrid[0:rows, 0:rows].reshape(2, -1) * pitch + pitch / 2 + rng.uniform(-0.5, 0.5, (2, rows**2))
     a = case.diameter_px / 2
     b = a * np.cos(np.radians(case.tilt_deg))
     ellipses = [(*centre, a, b, theta) for *centre, theta in zip(u, v, rng.uniform(0, np.pi, rows**2), strict=True)]
     covered = np.zeros((size, size))
-    bound = 0.0
+    bound = axis_bound = 0.0
     for ellipse in ellipses:
         box = box_of(*ellipse[:3], case.blur_px, covered.shape)
         covered[box] += coverage(*ellipse, case.blur_px, box)
-        bound += np.trace(bound_px2(ellipse, case, box)) / len(ellipses)
+        cov = bound_px2(ellipse, case, box)
+        bound += np.trace(cov[:2, :2]) / len(ellipses)
+        axis_bound += np.trace(cov[2:, 2:]) / (2 * len(ellipses))
     light = 1 + case.light_per_px * (np.arange(size) - size / 2)
     grey = (case.around + (case.inside - case.around) * covered) * light
     options = DetectOptions(polarity="bright" if case.inside > case.around else "dark")
-    truth = np.stack([u, v], axis=1)
-
-    scale = 60000 / grey.max()
-    still, _ = errors(np.rint(grey * scale).astype(np.uint16), truth, options)
-    error, chi2 = [], []
+    deep = 65535 / case.white if np.isfinite(case.white) else 60000 / grey.max()
+    still, _, still_axes, _ = errors(np.rint(grey * deep).clip(0, 65535).astype(np.uint16), ellipses, options)
+    error, chi2, axes, along = [], [], [], []
+    is_deep = np.isinf(case.white) and grey.max() > 255
     for _ in range(draws):
         noisy = np.rint(grey + case.noise * rng.standard_normal(grey.shape))
-        noisy = noisy.clip(0, None).astype(np.uint16 if grey.max() > 255 else np.uint8)
-        found, squares = errors(noisy, truth, options)
-        error.append(found)
-        chi2.append(squares)
-    squares = np.concatenate(chi2)
+        noisy = noisy.clip(0, 65535).astype(np.uint16) if is_deep else noisy.clip(0, 255).astype(np.uint8)
+        for kept, one in zip((error, chi2, axes, along), errors(noisy, ellipses, options), strict=True):
+            kept.append(one)
+    squares, axis = np.concatenate(chi2), np.concatenate(axes)
+    axis_px2 = np.mean((axis - axis.mean(axis=0)) ** 2)
     return Accuracy(
         bias_px=float(np.abs(still.mean(axis=0)).max()),
         worst_px=float(np.hypot(*still.T).max()),
@@ -167,11 +204,15 @@ def accuracy(case: Case, dots: int, draws: int) -> Accuracy:
         chi2=float(squares.mean() / 2),
         beyond=float(np.mean(squares > 5.991)),
         below=float(np.mean(squares < 0.1026)),
+        recall=len(squares) / (draws * len(ellipses)),
+        axis_bias_px=float(np.abs(still_axes.mean(axis=0)).max()),
+        axis_scatter=float(np.sqrt(axis_px2 / axis_bound)),
+        axis_to_centre=float(axis_px2 / np.concatenate(along).mean()),
     )
 
 
 def bound_px2(ellipse: tuple[float, ...], case: Case, box: tuple[slice, slice]) -> np.ndarray:
-    """Cramér-Rao bound of the covariance of a dot's centre."""
+    """Cramér-Rao bound of the covariance of a dot's centre and semi-axes; of pixels that do not saturate."""
     x = np.array([*ellipse[:2], *_form(*ellipse[2:]), case.blur_px])
     step = 1e-3
     columns = []
@@ -181,7 +222,15 @@ def bound_px2(ellipse: tuple[float, ...], case: Case, box: tuple[slice, slice]) 
         low[i] -= step
         columns.append((_covered(high, box) - _covered(low, box)) / (2 * step) * (case.inside - case.around))
     J = np.stack([*columns, np.ones(columns[0].size), _covered(x, box)], axis=1)
-    return np.asarray(np.linalg.inv(J.T @ J / (case.noise**2 + 1 / 12))[:2, :2])
+    light = case.around + (case.inside - case.around) * _covered(x, box)
+    J = J[light < case.white]
+    a, b, theta = ellipse[2:]
+    c, s = np.cos(theta), np.sin(theta)
+    by_form = np.zeros((4, J.shape[1]))
+    by_form[0, 0] = by_form[1, 1] = 1
+    by_form[2, 2:5] = np.array([c * c, 2 * c * s, s * s]) / (2 * a)
+    by_form[3, 2:5] = np.array([s * s, -2 * c * s, c * c]) / (2 * b)
+    return np.asarray(by_form @ np.linalg.inv(J.T @ J / (case.noise**2 + 1 / 12)) @ by_form.T)
 
 
 def _form(a: float, b: float, theta: float) -> tuple[float, float, float]:
@@ -195,13 +244,22 @@ def _covered(x: np.ndarray, box: tuple[slice, slice]) -> np.ndarray:
     return coverage(x[0], x[1], np.sqrt(mean + spread), np.sqrt(mean - spread), theta, x[5], box).ravel()
 
 
-def errors(image: np.ndarray, truth: np.ndarray, options: DetectOptions) -> tuple[np.ndarray, np.ndarray]:
-    """Errors of the dots found (px), and their squares weighed by the stated covariances."""
-    dots = detect(image, options)
-    distance = np.hypot(*(truth[:, None] - dots.uv_px[None]).transpose(2, 0, 1))
+def errors(
+    image: np.ndarray, ellipses: list[tuple[float, ...]], options: DetectOptions
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Of the dots found: errors (px), their squares weighed by the stated covariances, errors of the semi-axes (px),
+    and stated variances of the centre along these (px²)."""
+    dots, truth = detect(image, options), np.array(ellipses)
+    distance = np.hypot(*(truth[:, None, :2] - dots.uv_px[None]).transpose(2, 0, 1))
     target, dot = np.nonzero(distance < 1.0)
-    error = dots.uv_px[dot] - truth[target]
-    return error, np.einsum("ni,ni->n", error, np.linalg.solve(dots.cov_px2[dot], error[:, :, None])[:, :, 0])
+    error, cov = dots.uv_px[dot] - truth[target, :2], dots.cov_px2[dot]
+    squares = np.einsum("ni,ni->n", error, np.linalg.solve(cov, error[:, :, None])[:, :, 0])
+    axis = np.stack([np.cos(truth[target, 4]), np.sin(truth[target, 4])], axis=1)
+    along = np.stack([axis, axis[:, ::-1] * [-1, 1]], axis=1)
+    return (
+        *(error, squares, dots.ellipse[dot, :2] - truth[target, 2:4]),
+        np.einsum("nki,nij,nkj->nk", along, cov, along),
+    )
 
 
 def searched(name: str, images: int) -> tuple[str, ...]:
@@ -278,6 +336,55 @@ def all_sizes(rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
     light = 1 - 0.3 * ((np.arange(w) / w - 0.4) ** 2 + ((np.arange(h) / h - 0.5) ** 2)[:, None])
     noisy = np.rint(ground * light + 2 * rng.standard_normal((h, w)))
     return noisy.clip(0, 255).astype(np.uint8), np.array(uv)
+
+
+class Hidden(NamedTuple):
+    """What became of dots that another thing hides in part."""
+
+    accepted: float
+    """Share of dots for which one was reported within half a diameter of the centre."""
+    off_px: float
+    """Median distance of those from the true centre; NaN where there were none."""
+    beyond: float
+    """Share of those off by more than three standard deviations as stated."""
+
+
+def hidden(diameter_px: float, share: float, draws: int) -> Hidden:
+    """Dark dots on light ground, tilted up to 60°, ``share`` of each beyond a straight edge of any other grey value."""
+    rng = np.random.default_rng(int(100 * diameter_px + 1000 * share))
+    # Depth of the segment of a unit circle that has the share of its area.
+    depth = np.linspace(0, 2, 4001)
+    area = (np.arccos(1 - depth) - (1 - depth) * np.sqrt(np.maximum(0, 2 * depth - depth**2))) / np.pi
+    cut = 1 - np.interp(share, area, depth)
+    accepted, off, beyond = 0, [], []
+    for _ in range(draws):
+        size = int(1.5 * diameter_px + 40)
+        u, v = size / 2 + rng.uniform(-0.5, 0.5, 2)
+        a, blur_px = diameter_px / 2, 0.7
+        b, theta = a * np.cos(np.radians(rng.uniform(0, 60))), rng.uniform(0, np.pi)
+        box = slice(0, size), slice(0, size)
+        grey = 180 - 150 * coverage(u, v, a, b, theta, blur_px, box)
+        along = rng.uniform(0, 2 * np.pi)
+        # The line a unit circle is cut by, in pixels: normal · x = reach.
+        c, s = np.cos(theta), np.sin(theta)
+        x, y = np.cos(along) / a, np.sin(along) / b
+        normal = np.array([c * x - s * y, s * x + c * y])
+        length = np.hypot(*normal)
+        rows, columns = np.mgrid[:size, :size]
+        distance = (normal[0] * (columns - u) + normal[1] * (rows - v) - cut) / length
+        beyond_edge = ndtr(distance / np.hypot(blur_px, 0.29))
+        other = rng.choice([rng.uniform(90, 160), rng.uniform(200, 250)])
+        grey += (other - grey) * beyond_edge
+        image = np.rint(grey + 2 * rng.standard_normal(grey.shape)).clip(0, 255).astype(np.uint8)
+        dots = detect(image, DetectOptions(polarity="dark"))
+        error = dots.uv_px - [u, v]
+        near = np.flatnonzero(np.hypot(*error.T) < diameter_px / 2)
+        if len(near):
+            accepted += 1
+            best = near[np.argmin(np.hypot(*error[near].T))]
+            off.append(np.hypot(*error[best]))
+            beyond.append(error[best] @ np.linalg.solve(dots.cov_px2[best], error[best]) > 11.83)
+    return Hidden(accepted / draws, float(np.median(off)) if off else np.nan, float(np.mean(beyond)) if off else np.nan)
 
 
 def timed(repeats: int = 60) -> dict[str, tuple[float, float]]:

@@ -235,8 +235,30 @@ def test_texture_by_itself_has_no_dots() -> None:
         assert len(detect(np.clip(np.rint(image), 0, 255).astype(np.uint8), DetectOptions())) == 0
 
 
+@pytest.mark.parametrize(
+    ("diameter_px", "share"), [(20, 0.2), (20, 0.4), (40, 0.1), (40, 0.5), (100, 0.05), (100, 0.3)]
+)
+def test_dots_hidden_in_part_are_refused(diameter_px: float, share: float) -> None:
+    """What hides them is darker than their surround, or brighter, and has a straight edge; shares are of the area."""
+    depth = np.linspace(0, 2, 1001)  # of a segment of the unit circle
+    area = (np.arccos(1 - depth) - (1 - depth) * np.sqrt((2 * depth - depth**2).clip(0))) / np.pi
+    cut = 1 - np.interp(share, area, depth)
+    rng = np.random.default_rng(int(diameter_px))
+    scene = grid(rng, diameter_px, 30, 0.7, 1)
+    u, v, a, b, theta = scene.ellipses[0]
+    rows, columns = np.mgrid[: scene.coverage.shape[0], : scene.coverage.shape[1]]
+    x = (np.cos(theta) * (columns - u) + np.sin(theta) * (rows - v)) / a
+    y = (np.cos(theta) * (rows - v) - np.sin(theta) * (columns - u)) / b
+    for direction in np.radians([10, 100, 190, 280]):
+        for other in (120, 235):
+            beyond = np.clip(0.5 + b * (np.cos(direction) * x + np.sin(direction) * y - cut), 0, 1)
+            image = (180 - 150 * scene.coverage) * (1 - beyond) + other * cv2.GaussianBlur(beyond, (0, 0), 0.7)
+            image += 2 * rng.standard_normal(image.shape)
+            assert len(detect(np.clip(np.rint(image), 0, 255).astype(np.uint8), DARK)) == 0
+
+
 def test_a_dot_that_tells_nothing_of_the_light_is_left_as_it_is() -> None:
-    fit = np.arange(17.0)[None]
+    fit = np.arange(18.0)[None]
     left = detection.share_gradients(fit, np.zeros((1, 4)), np.zeros((1, 6, 6)), np.full(4, 1e-3))
     np.testing.assert_array_equal(left[0], fit[0, [0, 1, 7, 8, 9]])
 

@@ -15,9 +15,11 @@ Grey = UInt8[np.ndarray, "h w"] | UInt16[np.ndarray, "h w"]
 # blur of the edge (px) to start with.
 # Columns of a fit: those, with the moments of the ellipse; covariance of the centre (px²), semi-axes (px) and the long
 # one's angle (rad), grey values of the surround and of the step from it to the dot, rms residual, what aliasing adds
-# to the covariance (px²). NaN where there is no fit.
-U, V, UU, UV, VV, SIGN, BLUR, COV_UU, COV_UV, COV_VV, A, B, THETA, AROUND, STEP, RESIDUAL, ALIASING = range(17)
-COLUMNS = 17
+# to the covariance (px²), how much opposite sides of the edge differ (steps). NaN where there is no fit.
+U, V, UU, UV, VV, SIGN, BLUR, COV_UU, COV_UV, COV_VV, A, B, THETA, AROUND, STEP, RESIDUAL, ALIASING, LOPSIDED = range(
+    18
+)
+COLUMNS = 18
 
 BLOCK_PX = 4  # side of the blocks of pixels whose extremes are taken
 
@@ -38,6 +40,7 @@ _MIN_FILL = 0.75  # area of a blob in areas of the ellipse of its moments; small
 _MAX_START = 0.4  # rms residual of a fit worth beginning, in steps
 _SMALL_PX = 2.5  # mean semi-axis of a dot whose surround may end within a wide window's reach all round
 _SHARP_PX = 1.0  # largest blur of such a dot
+_CHANCE = 4.0  # standard deviations by which noise may let opposite sides of a dot differ
 _ENOUGH = 160  # pixels for the first, rough fit
 
 
@@ -545,6 +548,31 @@ def _leading_inverse(H: np.ndarray, L: np.ndarray) -> tuple[float, float, float]
 
 
 @njit(cache=True, nogil=True)
+def _lopsided(pixels: np.ndarray, n: int, x: np.ndarray, noise: float, J: np.ndarray) -> float:
+    """How much the residuals of opposite eighths of the edge differ, inside or outside of it, beyond noise (steps).
+
+    What the model gets wrong of a whole dot is the same on opposite sides, and what a thing before it does is not.
+    """
+    _differentiate(pixels, n, x, J)
+    total, count = np.zeros((2, 8)), np.zeros((2, 8))
+    for i in range(n):
+        du, dv = pixels[0, i] - x[0], pixels[1, i] - x[1]
+        y0, y1 = x[_P] * du + x[_R] * dv, x[_T] * dv
+        eighth = 4 * (y0 > 0) + 2 * (y1 > 0) + (abs(y0) > abs(y1))
+        side = 1 if y0 * y0 + y1 * y1 < 1 else 0
+        total[side, eighth] += J[_N, i]
+        count[side, eighth] += 1
+    worst = 0.0
+    for side in range(2):
+        for k in range(4):
+            one, other = count[side, k], count[side, k ^ 6]
+            if one > 0 and other > 0:
+                differ = abs(total[side, k] / one - total[side, k ^ 6] / other)
+                worst = max(worst, differ - _CHANCE * noise * sqrt(1 / one + 1 / other))
+    return worst / abs(x[_STEP])
+
+
+@njit(cache=True, nogil=True)
 def fit_ellipses(
     image: Grey,
     start: Float[np.ndarray, "m 7"],
@@ -553,7 +581,7 @@ def fit_ellipses(
     max_misfit: float,
     noise: float,
     is_rough: bool,
-) -> tuple[Float[np.ndarray, "m 17"], Float[np.ndarray, "m 4"], Float[np.ndarray, "m 6 6"]]:
+) -> tuple[Float[np.ndarray, "m 18"], Float[np.ndarray, "m 4"], Float[np.ndarray, "m 6 6"]]:
     """Least squares of a blurred ellipse to the grey values about each start.
 
     ``start`` holds u, v, uu, uv, vv, sign and blur of the blobs. The covariance is
@@ -646,6 +674,12 @@ def fit_ellipses(
                         c_uu, c_uv, c_vv = n_uu, n_uv, n_vv
         if not c_uu > 0:
             continue
+        out[k, LOPSIDED] = 0.0
+        if not is_rough:
+            margin = max(1.5, 2 * x[_S] * radius)
+            n = _gather(image, u0, v0, radius, x, margin, margin + 2, pixels)
+            if n > 0:
+                out[k, LOPSIDED] = _lopsided(pixels, n, x, max(noise, sqrt(_QUANTISATION_VARIANCE)), J)
         # What sampling a sharp edge adds (px², each way): found to fall with the number of pixels along the edge, and
         # as the spectrum of the blur at the sampling frequency, exp(−2π²s²).
         blur_px = x[_S] * radius
@@ -678,7 +712,7 @@ def fit_ellipses(
 
 @njit(cache=True, nogil=True)
 def share_gradients(
-    fits: Float[np.ndarray, "m 17"],
+    fits: Float[np.ndarray, "m 18"],
     gradient: Float[np.ndarray, "m 4"],
     information: Float[np.ndarray, "m 6 6"],
     prior: Float[np.ndarray, "4"],
