@@ -7,6 +7,8 @@ from trifix.files.maps import read_map
 from trifix.files.recordings import Recording, read_recording
 from trifix.geometry.camera import Camera, StereoRig
 from trifix.geometry.pose import Pose
+from trifix.live import Live
+from trifix.outputs.publish import Publisher
 from trifix.outputs.report import Report
 from trifix.outputs.results import ResultsWriter
 from trifix.positioner import Positioner, Positions, position
@@ -24,6 +26,8 @@ from trifix.records import (
     StereoImages,
     StereoMatches,
 )
+from trifix.sources.cameras import CameraFrames, Shot, SideBySide, TwoCameras, VideoCamera
+from trifix.sources.replay import Replay
 from trifix.sources.simulation import simulate
 from trifix.stages.detect import detect
 from trifix.stages.identify import identifier
@@ -36,29 +40,37 @@ from trifix.stages.verify import verify
 __all__ = [
     "Adjusted",
     "Camera",
+    "CameraFrames",
     "Config",
     "Constraints",
     "Dots",
     "Fix",
     "Frame",
     "KnownLength",
+    "Live",
     "NoFix",
     "NotAdjusted",
     "Pose",
     "Positioner",
     "Positions",
+    "Publisher",
     "Reason",
     "Recording",
     "ReferenceMap",
+    "Replay",
     "Report",
     "ResultsWriter",
     "SensorPoints",
+    "Shot",
+    "SideBySide",
     "Step",
     "StereoDots",
     "StereoImages",
     "StereoMatches",
     "StereoRig",
     "TrifixError",
+    "TwoCameras",
+    "VideoCamera",
     "adjust_steps",
     "correct_eccentricity",
     "detect",

@@ -15,8 +15,9 @@ import sys
 import threading
 import tomllib
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import ExitStack, contextmanager, suppress
+from contextlib import ExitStack, closing, contextmanager, suppress
 from dataclasses import asdict, replace
+from importlib import import_module
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -26,7 +27,7 @@ from rich.text import Text
 
 import trifix
 from trifix.console import Json, answer, progress_bar, table_of
-from trifix.errors import CalibrationError, MapError, RecordingError, TrifixError
+from trifix.errors import CalibrationError, MapError, RecordingError, TrifixError, ViewerError
 
 app = App(
     name="trifix",
@@ -131,9 +132,7 @@ def run(
         raise CycloptsError(msg=f"{name} needs the adjustment of the whole recording, which was left out.")
     if map_ is not None and control is not None:
         raise CycloptsError(msg="--map and --control both say what the world is: choose one.")
-    given = None if map_ is None else trifix.read_map(map_)
-    if given is not None and not len(given):
-        raise MapError(f"{map_}: found no target, expected at least three; choose another map or none.")
+    given = None if map_ is None else _read_map(map_)
     constraints = trifix.Constraints(
         given,
         control=None if control is None else trifix.read_control(control),
@@ -145,6 +144,107 @@ def run(
         raise CalibrationError(f"{recording} has {what}: a rig is refined where one saw the dots of all frames.")
     is_map_frozen = given is not None and map_mode != "grow"
     _position(frames, out, options, json, constraints, is_map_frozen, is_online=online or paper)
+
+
+@app.command(sort_key=1)
+def live(
+    *,
+    out: Out,
+    left: str | None = None,
+    right: str | None = None,
+    side_by_side: str | None = None,
+    calibration: Path | None = None,
+    max_skew_ms: float = 10.0,
+    replay: Path | None = None,
+    speed: float | Literal["max"] = 1.0,
+    level: Annotated[Level | None, Parameter(name="--from")] = None,
+    maps: Annotated[tuple[Path, ...], Parameter(name="--map", show_default=False)] = (),
+    map_mode: Literal["frozen", "grow"] | None = None,
+    publish: str | None = None,
+    viewer: Annotated[bool, Parameter(negative="--no-viewer")] = True,
+    port: int = 8080,
+    config: Path | None = None,
+    settings: Settings = (),
+    json: Json = False,
+) -> None:
+    """Position what cameras see, as it comes; ctrl-C ends the run.
+
+    A camera is a number, a URL, a GStreamer pipeline (in quotes) or a video file.
+
+    Args:
+        out: Folder for the results; with several maps, each has a folder in it.
+        left: The left camera.
+        right: The right camera.
+        side_by_side: One camera that delivers both images beside one another.
+        calibration: File of the cameras' calibration.
+        max_skew_ms: A pair of images is refused if they were taken further apart (ms).
+        replay: Folder of a recording to play in place of cameras.
+        speed: How many times as fast as it was recorded; max leaves out no frame and waits for none.
+        level: Begin with images, dots or points of the recording.
+        maps: CSV file of a body's targets; may be repeated, and each body has a pose of its own.
+        map_mode: Leave given maps as they are (frozen, the default), or let them grow by what else stands still.
+        publish: Send a datagram a frame to udp://HOST:PORT; without a HOST, to this machine.
+        viewer: Show the run in a browser.
+        port: Port at which this machine's browser finds it, 0 for any that is free; of further bodies, the next ones.
+        config: TOML file of options; `trifix config` prints one.
+        settings: An option by its full name, such as match.max_depth_mm=900; may be repeated.
+    """
+    if [left is not None or right is not None, side_by_side is not None, replay is not None].count(True) != 1:
+        raise CycloptsError(msg="Name either two cameras (--left, --right), or one (--side-by-side), or a --replay.")
+    if (left is None) != (right is None):
+        raise CycloptsError(msg="Name both cameras, --left and --right.")
+    if (replay is None) != (calibration is not None):
+        raise CycloptsError(msg="Cameras need a --calibration; a recording has its own.")
+    if not maps and map_mode is not None:
+        raise CycloptsError(msg="--map-mode says what becomes of a given map: name it with --map.")
+    if speed != "max" and not 0 < speed < math.inf:
+        raise CycloptsError(msg="--speed must be positive and finite, or max.")
+    if max_skew_ms < 0:
+        raise CycloptsError(msg="--max-skew-ms must not be negative.")
+    options = _options(config, settings)
+    given = _bodies(maps)
+    source: trifix.Replay | trifix.CameraFrames
+    if replay is not None:
+        recording = trifix.read_recording(replay, level, options.noise.sigma_px)
+        source = trifix.Replay(recording, math.inf if speed == "max" else speed)
+        name, begins_with, is_noise_stated = recording.path.resolve().name, recording.level, recording.is_noise_stated
+    else:
+        assert calibration is not None, "asked before"
+        source = _cameras(left, right, side_by_side, calibration, max_skew_ms)
+        name, begins_with, is_noise_stated = "live", "images", False
+    bodies = {
+        body: trifix.Positioner(options, map, map is not None and map_mode != "grow", is_noise_stated)
+        for body, map in given.items()
+    }
+    folders = {body: out / body if len(bodies) > 1 else out for body in bodies}
+    _run_live(source, bodies, folders, name, begins_with, publish, port if viewer else None, speed == "max", json)
+
+
+def _bodies(maps: tuple[Path, ...]) -> "dict[str, trifix.ReferenceMap | None]":
+    """The map of each body, by its name; a single body without a map has none."""
+    given: dict[str, trifix.ReferenceMap | None] = {}
+    for path in maps:
+        name = path.stem if path.stem != "map" else path.resolve().parent.name  # as `trifix run` calls them all
+        if name in given:
+            raise MapError(f"{path}: another map is called {name} as well; give the file another name.")
+        given[name] = _read_map(path)
+    return given or {"": None}
+
+
+def _cameras(
+    left: str | None, right: str | None, side_by_side: str | None, calibration: Path, max_skew_ms: float
+) -> "trifix.CameraFrames":
+    from trifix.files.calibrations import read_rig
+    from trifix.sources.cameras import CameraFrames, SideBySide, TwoCameras, VideoCamera
+
+    rig = read_rig(calibration)
+    width, height = rig.left.width_px, rig.left.height_px
+    if side_by_side is not None:
+        return CameraFrames(SideBySide(VideoCamera(side_by_side, (width + rig.right.width_px, height))), rig)
+    assert left is not None, "asked before"
+    assert right is not None, "asked before"
+    cameras = VideoCamera(left, (width, height)), VideoCamera(right, (rig.right.width_px, rig.right.height_px))
+    return CameraFrames(TwoCameras(*cameras, max_skew_ms), rig)
 
 
 @app.command(sort_key=1)
@@ -399,8 +499,12 @@ def config(*, config: Path | None = None, settings: Settings = (), json: Json = 
 @app.command(sort_key=6)
 def warmup(*, json: Json = False) -> None:
     """Compile the inner loops, once for this machine, so that the first frame need not wait for it."""
+    names = _compile()
+    answer({"modules": names}, json, lambda: None)
+
+
+def _compile() -> list[str]:
     import pkgutil
-    from importlib import import_module
 
     from trifix import kernels
 
@@ -408,9 +512,10 @@ def warmup(*, json: Json = False) -> None:
     with progress_bar("modules") as progress:
         for name in progress.track(names, description="compiling"):
             import_module(name).warm_up()
-    answer({"modules": names}, json, lambda: None)
+    return names
 
 
+_REFRESH_S = 0.1
 _INTERRUPTED = "interrupted; what was finished until then is whole."
 
 
@@ -497,6 +602,14 @@ def _options(
         given[key.strip()] = value.strip()
     start = paper_options() if is_paper else trifix.read_config(file) if file else trifix.Config()
     return with_overrides(start, given)
+
+
+def _read_map(path: Path) -> "trifix.ReferenceMap":
+    """The map in a file, which must hold something."""
+    given = trifix.read_map(path)
+    if not len(given):
+        raise MapError(f"{path}: found no target, expected at least three; choose another map or none.")
+    return given
 
 
 def _simulate(scene: str, out: Path, level: Level, seed: int = 0, frames: int | None = None) -> None:
@@ -602,6 +715,101 @@ def _adjusted(
         final, adjusted, fault = steps, trifix.NotAdjusted(str(error)), error
     progress.update(task, total=progress.tasks[task].completed)
     return final, adjusted, fault
+
+
+def _run_live(
+    source: "trifix.Replay | trifix.CameraFrames",
+    bodies: "dict[str, trifix.Positioner]",
+    folders: dict[str, Path],
+    name: str,
+    level: Level,
+    publish: str | None,
+    port: int | None,
+    is_lossless: bool,
+    json: bool,
+) -> None:
+    """Judge frames as they come until their source or the operator ends it, and say what it amounts to."""
+    from rich.console import Console, Group
+    from rich.live import Live as Display
+
+    from trifix.config import to_toml
+    from trifix.live import Live, Rates, Viewer
+    from trifix.outputs.publish import Publisher
+    from trifix.outputs.terminal import live_lines, summary_table
+
+    if not is_lossless:
+        _compile()
+    with ExitStack() as open_things:
+        viewers: dict[str, Viewer] = {}
+        if port is not None:
+            try:
+                from trifix.outputs.viewer import Viewer as Page
+
+                for k, body in enumerate(bodies):
+                    page = open_things.enter_context(closing(Page(port=port + k if port else 0, title=body or name)))
+                    viewers[body] = page
+                    print(f"{body or 'viewer'}  {page.url}", file=sys.stderr)
+            except ViewerError as error:
+                raise ViewerError(f"{error} Without a viewer: --no-viewer.") from error
+        publisher = None
+        if publish is not None:
+            publisher = open_things.enter_context(closing(Publisher(publish)))
+        reports, doubts = {body: trifix.Report() for body in bodies}, set[str]()
+        results = {
+            body: open_things.enter_context(
+                trifix.ResultsWriter(folders[body], name, level, to_toml(positioner.config), is_online=True)
+            )
+            for body, positioner in bodies.items()
+        }
+
+        def watch(body: str, step: trifix.Step, rates: Rates) -> None:
+            if publisher is not None:
+                publisher.send(body, step, rates)
+            results[body].write(step, rates.dropped)
+            reports[body].show(step)
+
+        stopped = _told_to_stop(open_things)
+        run = Live(bodies, [watch], viewers, is_lossless)
+        run.follow(source)
+        console = Console(stderr=True)
+        with Display(console=console, auto_refresh=False) as display:
+            is_over = False
+            while not is_over:
+                is_over = run.wait(_REFRESH_S)
+                for doubt in {each.doubt for each in results.values()} - doubts - {""}:
+                    doubts.add(doubt)
+                    console.print(Text(doubt, "yellow"))
+                display.update(live_lines({body: run.status(body) for body in bodies}), refresh=True)
+                if stopped():
+                    run.stop()
+        if not console.is_terminal:
+            console.line()
+        if stopped() and isinstance(source, trifix.Replay):
+            raise KeyboardInterrupt  # the recording goes on; cameras end when they are told to
+        summaries = {body: each.finish() for body, each in results.items()}
+    pages = {body: folder / "report.html" for body, folder in folders.items()}
+    for body, summary in summaries.items():
+        reports[body].write(pages[body], summary)
+    found = {body: {**asdict(summary), "report": pages[body]} for body, summary in summaries.items()}
+    answer(
+        found if len(found) > 1 else found[next(iter(found))],
+        json,
+        lambda: Group(*(summary_table(summary, pages[body]) for body, summary in summaries.items())),
+    )
+
+
+def _told_to_stop(restored: ExitStack) -> Callable[[], bool]:
+    """Whether an interrupt has come since; a second one interrupts."""
+    told: list[int] = []
+
+    def note(number: int, frame: object) -> None:
+        told.append(number)
+        if len(told) > 1:
+            raise KeyboardInterrupt
+
+    for number in (signal.SIGINT, signal.SIGTERM):
+        restored.callback(signal.signal, number, signal.signal(number, note))
+    return lambda: bool(told)
 
 
 @contextmanager

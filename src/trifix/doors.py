@@ -10,7 +10,8 @@ import numpy as np
 from jaxtyping import Bool
 
 from trifix.errors import MapError
-from trifix.records import Frame, Reason, ReferenceMap, SensorPoints, Unusable
+from trifix.geometry.camera import Camera
+from trifix.records import Frame, GreyOrColour, Reason, ReferenceMap, SensorPoints, StereoDots, StereoImages, Unusable
 
 _FARTHEST_MM = 1e6  # no point lies, and no error reaches, a kilometre off
 _LEAST_VARIANCE_MM2 = 1e-12  # a nanometre: nothing is known better
@@ -26,6 +27,44 @@ def in_order(frame: Frame, last_ns: int, last_index: int) -> Frame:
     else:
         return frame
     return replace(frame, content=Unusable(Reason.time_reversed, detail))
+
+
+def with_usable_images(frame: Frame, images: StereoImages) -> Frame:
+    """The same frame, refused where its images are not those of its rig's cameras, or nobody knows the rig."""
+    if frame.rig is None:
+        return _without_rig(frame, "images")
+    for side, image, camera in (("left", images.left, frame.rig.left), ("right", images.right, frame.rig.right)):
+        if fault := image_fault(image, camera):
+            return replace(frame, content=Unusable(Reason.unreadable_image, f"The {side} image {fault}."))
+    return frame
+
+
+def image_fault(image: GreyOrColour, camera: Camera) -> str:
+    """What an image is that the camera cannot have taken; empty where it can."""
+    if image.dtype not in (np.uint8, np.uint16) or image.ndim not in (2, 3) or image.shape[2:] not in ((), (3,)):
+        return f"is {image.dtype} of shape {image.shape}, expected grey or BGR of 8 or 16 bit"
+    if image.shape[:2] != (camera.height_px, camera.width_px):
+        size = f"{image.shape[1]} x {image.shape[0]} pixels"
+        return f"is {size}, its calibration is for {camera.width_px} x {camera.height_px}"
+    return ""
+
+
+def with_usable_dots(frame: Frame, dots: StereoDots) -> Frame:
+    """The same frame, refused where a dot is not a number, or nobody knows the rig."""
+    if frame.rig is None:
+        return _without_rig(frame, "dots")
+    for side, each in (("left", dots.left), ("right", dots.right)):
+        finite = np.isfinite(each.uv_px).all(axis=1) & np.isfinite(each.cov_px2).all(axis=(1, 2))
+        if not finite.all():
+            detail = (
+                f"{(~finite).sum()} of {len(each)} {side} dots are not finite, the first is dot {np.argmin(finite)}."
+            )
+            return replace(frame, content=Unusable(Reason.bad_points, detail))
+    return frame
+
+
+def _without_rig(frame: Frame, what: str) -> Frame:
+    return replace(frame, content=Unusable(Reason.no_calibration, f"{what.capitalize()} came without a rig."))
 
 
 def with_usable_points(frame: Frame, points: SensorPoints) -> Frame:

@@ -14,6 +14,10 @@ class RecordingError(TrifixError):
     """A recording that is missing, incomplete or contradicts itself."""
 
 
+class CameraError(TrifixError):
+    """A camera that cannot be opened."""
+
+
 class MapError(TrifixError):
     """A reference map that cannot be used."""
 

@@ -8,6 +8,7 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
+from time import perf_counter
 from typing import assert_never
 
 import numpy as np
@@ -15,10 +16,11 @@ from jaxtyping import Int
 
 from trifix.bundle import Adjusted, Constraints, NotAdjusted, adjust_steps
 from trifix.config import Config
-from trifix.doors import checked_map, in_order, with_usable_points
+from trifix.doors import checked_map, in_order, with_usable_dots, with_usable_images, with_usable_points
 from trifix.errors import MapError
 from trifix.files.recordings import Recording, read_recording
 from trifix.geometry.alignment import spread_off_line_mm
+from trifix.geometry.camera import StereoRig
 from trifix.geometry.pose import Pose
 from trifix.island import NOTHING, Island, Stopwatch
 from trifix.records import (
@@ -61,10 +63,21 @@ _HERE_PERHAPS = 1e-3  # no part of the object is new where what is known agrees 
 _COULD_BE_ELSEWHERE = (Reason.no_candidate, Reason.not_proven, Reason.out_of_time)
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class Found:
+    """What was found in the images of a frame."""
+
+    dots: StereoDots
+    """The dots, with the noise to start from."""
+    detect_ms: float
+    """How long it took (ms)."""
+
+
 class Positioner:
     """Positions frames one after another, each by what was known at its time, and lets the map grow.
 
     With a map given, poses are in its coordinates; without one, the first frame with three points defines the world.
+    ``rig`` is that of the frames that are pushed; others bring their own.
     """
 
     def __init__(
@@ -73,8 +86,10 @@ class Positioner:
         map: ReferenceMap | None = None,
         is_map_frozen: bool = False,
         is_noise_stated: bool = False,
+        rig: StereoRig | None = None,
     ) -> None:
         self.config = config or Config()
+        self.rig = rig
         self.noise = self._epipolar = self._residuals = NoiseScale()
         self._is_noise_stated = is_noise_stated
         self._sought = 1.0
@@ -108,18 +123,61 @@ class Positioner:
         for frame in frames:
             yield self.step(frame)
 
-    def step(self, frame: Frame) -> Step:
-        """Judges one frame, and lets the map grow by it if it is positioned."""
-        frame = in_order(frame, self._last_ns, self._last_index)
-        if isinstance(frame.content, SensorPoints):
-            frame = with_usable_points(frame, frame.content)
-        self._last_ns, self._last_index = max(self._last_ns, frame.timestamp_ns), max(self._last_index, frame.index)
-        return self._judge(frame, learns=True)
+    def push(self, left: GreyOrColour | Dots, right: GreyOrColour | Dots, timestamp_ns: int) -> Step:
+        """Judges what the two cameras saw at a time, images or dots; the rig is the one given at the beginning."""
+        match left, right:
+            case Dots(), Dots():
+                return self._step_next(StereoDots(left, right), timestamp_ns)
+            case np.ndarray(), np.ndarray():
+                return self._step_next(StereoImages(left, right), timestamp_ns)
+            case _:
+                raise TypeError("Push two images or the dots of both, not one of each.")
 
-    def _judge(self, frame: Frame, learns: bool) -> Step:
+    def push_points(self, points: SensorPoints, timestamp_ns: int) -> Step:
+        """Judges points that were seen at a time."""
+        return self._step_next(points, timestamp_ns)
+
+    def _step_next(self, content: StereoImages | StereoDots | SensorPoints, timestamp_ns: int) -> Step:
+        return self.step(Frame(max(self._last_index + 1, 0), timestamp_ns, self.rig, content))
+
+    def find_dots(self, frame: Frame) -> Found | None:
+        """The dots in the images of a frame, if it has images that can be used.
+
+        Depends on no other frame: it may be called in another thread, for a frame that is yet to come.
+        """
+        content = frame.content
+        if not isinstance(content, StereoImages) or with_usable_images(frame, content) is not frame:
+            return None
+        start = perf_counter()
+        find = partial(_labelled_dots, options=self.config.detect)
+        left, right = self._cameras.map(find, (content.left, content.right))
+        dots = StereoDots(add_prior_noise(left, self.config.noise), add_prior_noise(right, self.config.noise))
+        return Found(dots, 1e3 * (perf_counter() - start))
+
+    def step(self, frame: Frame, found: Found | None = None) -> Step:
+        """Judges one frame, and lets the map grow by it if it is positioned.
+
+        ``found`` is what ``find_dots`` found in its images, if that has been done before.
+        """
+        frame = in_order(frame, self._last_ns, self._last_index)
+        match frame.content:
+            case SensorPoints():
+                frame = with_usable_points(frame, frame.content)
+            case StereoDots():
+                frame = with_usable_dots(frame, frame.content)
+            case StereoImages():
+                frame = with_usable_images(frame, frame.content)
+            case Unusable():
+                pass
+            case _:
+                assert_never(frame.content)
+        self._last_ns, self._last_index = max(self._last_ns, frame.timestamp_ns), max(self._last_index, frame.index)
+        return self._judge(frame, learns=True, found=found)
+
+    def _judge(self, frame: Frame, learns: bool, found: Found | None = None) -> Step:
         """The loop's body: sense, position, learn."""
         clock, events, added = Stopwatch(), list[Event](), NOTHING
-        dots, matches, centres, points = self._sense(frame, clock)
+        dots, matches, centres, points = self._sense(frame, found, clock)
         evidence = None if points is None else Evidence.of(points, matches, centres, frame.rig, self.noise.scale)
         island, identification, fix = self._position(frame, evidence, clock)
         there: Fix | None = fix if isinstance(fix, Fix) else None
@@ -178,16 +236,15 @@ class Positioner:
             return island.told(points, fix)
 
     def _sense(
-        self, frame: Frame, clock: Stopwatch
+        self, frame: Frame, found: Found | None, clock: Stopwatch
     ) -> tuple[StereoDots | None, StereoMatches | None, StereoDots | None, SensorPoints | None]:
         """Images to dots to pairs to centres to points; each level of a recording enters at its own stage."""
         options = self.config
         content = frame.content
         if isinstance(content, StereoImages):
-            with clock("detect"):
-                find = partial(_labelled_dots, options=options.detect)
-                left, right = self._cameras.map(find, (content.left, content.right))
-            content = StereoDots(add_prior_noise(left, options.noise), add_prior_noise(right, options.noise))
+            found = found or self.find_dots(frame)
+            assert found is not None, "frames are checked where they come in"
+            content, clock.ms["detect"] = found.dots, found.detect_ms
         match content:
             case StereoDots():
                 assert frame.rig is not None, "dots come with the rig that saw them"

@@ -13,6 +13,7 @@ import shutil
 import threading
 import time
 import tomllib
+from contextlib import closing
 from functools import partial
 from itertools import chain
 from pathlib import Path
@@ -39,6 +40,7 @@ FLUSH_S = 0.25
 CHECKPOINT_S = 5.0
 """Longest wait of a changed map in memory (s)."""
 
+_MOST_WAITING = 2000  # frames in memory
 _ISLANDS = "islands"
 _REVISED = ".revised"
 _POSE = "x_mm,y_mm,z_mm,qx,qy,qz,qw"
@@ -113,12 +115,16 @@ class ResultsWriter:
     ) -> None:
         self._close()
 
-    def write(self, step: Step) -> None:
-        """Take over the rows of one frame; they reach the disk within ``FLUSH_S``.
+    def write(self, step: Step, dropped: int = 0) -> None:
+        """Take over the rows of one frame; they reach the disk within ``FLUSH_S``, or this waits for a slow one.
+
+        ``dropped`` are the frames that were left out so far.
 
         Raises:
             RecordingError: earlier rows could not be written.
         """
+        while len(self._waiting) >= _MOST_WAITING and self._thread.is_alive():
+            time.sleep(0.01)
         self._complain()
         if self._folder == self._out:  # once is enough
             self._rig_check.watch(step)
@@ -148,7 +154,7 @@ class ResultsWriter:
             self._map = targets
             if step.elsewhere is not None:
                 self._island_maps[step.elsewhere.island] = step.elsewhere.map
-            self._tally.add(step, residual_px)
+            self._tally.add(step, residual_px, dropped)
 
     def start_over(self) -> None:
         """Begin again with the first frame; what has been written stands until the new is whole and takes its place.
@@ -164,14 +170,14 @@ class ResultsWriter:
                 self._flush()
                 self._publish()
                 self._write_state()
-                self._folder = self._out / _REVISED
+                with self._lock:
+                    self._folder = self._out / _REVISED
+                    self._tally = self._new_tally()
+                    self._island_maps = {}
                 self._folder.mkdir()
                 self._logs = self._open_logs()
         except OSError as error:
             raise RecordingError(f"{self._out}: results cannot be written there ({error.strerror}).") from error
-        with self._lock:
-            self._tally = self._new_tally()
-            self._island_maps = {}
         self._dots_written = 0
 
     @property
@@ -223,13 +229,18 @@ class ResultsWriter:
     def _flush(self) -> None:
         with self._lock:
             waiting, self._waiting = self._waiting, []
+
+        def lines(name: str) -> str:
+            return "".join(f"{row}\n" for row in chain.from_iterable(rows.get(name, ()) for rows in waiting))
+
         for name in sorted({name for rows in waiting for name in rows if name not in self._logs}):
-            path = self._folder / name  # of an island that is new
+            path = self._folder / name  # of an island; there may be too many to keep their files open
             path.parent.mkdir(parents=True, exist_ok=True)
-            self._logs = {name: _Log(path, _HEADERS[path.name]), **self._logs}
+            with closing(_Log(path, _HEADERS[path.name])) as log:
+                log.append(lines(name))
         if waiting:
             for name, log in self._logs.items():
-                log.append("".join(f"{row}\n" for row in chain.from_iterable(rows.get(name, ()) for rows in waiting)))
+                log.append(lines(name))
 
     def _open_logs(self) -> "dict[str, _Log]":
         return {
@@ -255,7 +266,8 @@ class ResultsWriter:
         if self._folder != self._out:
             return
         with self._lock:
-            targets, islands = self._map, dict(self._island_maps)
+            targets, islands, self._island_maps = self._map, self._island_maps, {}
+            parent = self._folder / _ISLANDS
             self._summary = self._tally.summary(
                 targets,
                 time.monotonic() - self._start,
@@ -264,9 +276,8 @@ class ResultsWriter:
                 adjusted=self._adjusted,
             )
         for number, there in islands.items():
-            folder = self._folder / _ISLANDS / str(number)
-            if folder.is_dir():  # its first rows may still wait in memory
-                write_map(there, folder / "map.csv")
+            (parent / str(number)).mkdir(parents=True, exist_ok=True)
+            write_map(there, parent / str(number) / "map.csv")
         write_map(targets, self._out / "map.csv")
         write_ply(targets, self._out / "map.ply")
         summary = msgspec.json.format(msgspec.json.encode(self._summary), indent=2).decode()
@@ -306,9 +317,10 @@ class _Log:
     """A file that grows by whole lines."""
 
     def __init__(self, path: Path, header: str) -> None:
-        self._file = path.open("wb", buffering=0)
-        self._length = 0
-        self.append(f"{header}\n" if header else "")
+        self._file = path.open("ab", buffering=0)
+        self._length = path.stat().st_size
+        if header and not self._length:
+            self.append(f"{header}\n")
 
     def append(self, lines: str) -> None:
         """Write lines in one go; where not all of them fit, none stays.

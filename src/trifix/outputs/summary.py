@@ -2,7 +2,6 @@
 
 import platform
 import tomllib
-from array import array
 from collections import Counter
 from dataclasses import dataclass
 from importlib.metadata import version
@@ -13,11 +12,13 @@ from jaxtyping import Float
 from trifix.bundle import Adjusted, NotAdjusted
 from trifix.geometry.pose import Pose
 from trifix.outputs.advice import advice_for_run
+from trifix.outputs.history import Thinned
 from trifix.records import Fix, NoFix, ReferenceMap, Step, TargetState
 
 STAGES = ("detect", "match", "triangulate", "identify", "orient", "verify", "update")
 """What is timed, in the order of the work."""
-_NOWHERE = (float("nan"),) * 12  # translation and rotation of a frame without a pose
+
+_TIMED = (*STAGES, "total")
 
 
 @dataclass(frozen=True, slots=True)
@@ -27,7 +28,7 @@ class Residuals:
     rms: float | None
     """Root mean square over all of them; None if there are none."""
     median: float | None
-    """Median over the frames of the root mean square within a frame."""
+    """Median over the frames of the root mean square within a frame (of a long run, over some of them)."""
     worst: float | None
     """The largest root mean square within a frame."""
     count: int
@@ -39,7 +40,7 @@ class Timing:
     """How long one stage took."""
 
     median_ms: float
-    """Median over the frames in which it ran (ms)."""
+    """Median over the frames in which it ran; of a long run, over some of them (ms)."""
     p99_ms: float
     """99th percentile (ms)."""
     frames: int
@@ -74,6 +75,8 @@ class Summary:
     """Frames with a pose."""
     refused: int
     """Frames without."""
+    dropped: int
+    """Frames of a live run that came faster than they could be judged, and were left out."""
     reasons: dict[str, int]
     """Frames per reason: of refusals, and of what is special about a positioned frame."""
     targets: dict[str, int]
@@ -105,34 +108,45 @@ class Summary:
 
 
 class Tally:
-    """Gathers a ``Summary`` from Steps, a few numbers a frame."""
+    """Gathers a ``Summary`` from Steps, a few numbers a frame, and no more in a day than in an hour."""
 
     def __init__(self, recording: str, level: str, config_toml: str, is_online: bool) -> None:
         self._recording, self._level, self._is_online = recording, level, is_online
         self._options: dict[str, object] = tomllib.loads(config_toml)
         self._frames = self._positioned = 0
-        self._reason: list[str] = []
-        self._points, self._pose = array("q"), array("d")
+        self._reasons: Counter[str] = Counter()
+        self._judged: Thinned[tuple[str, int, Pose | None]] = Thinned()
+        """Reason, points and pose of frames."""
         self._mm, self._px = _Spread(), _Spread()
-        self._timings_ms = {name: array("d") for name in (*STAGES, "total")}
+        self._timings_ms: Thinned[tuple[float, ...]] = Thinned()
+        self._timed = dict.fromkeys(_TIMED, 0)
         self._noise_scale = 1.0
+        self._dropped = 0
 
-    def add(self, step: Step, residual_px: Float[np.ndarray, "d"]) -> None:
-        """Count one frame, with the distances of its identified dots from their reprojected targets (px)."""
+    def add(self, step: Step, residual_px: Float[np.ndarray, "d"], dropped: int = 0) -> None:
+        """Count one frame, with the distances of its identified dots from their reprojected targets (px).
+
+        ``dropped`` are the frames left out so far.
+        """
         self._frames += 1
-        self._points.append(0 if step.points is None else len(step.points))
+        self._dropped = dropped
+        points = 0 if step.points is None else len(step.points)
+        pose: Pose | None = None
         match step.fix:
             case Fix() as fix:
                 self._positioned += 1
-                self._reason.append("" if fix.reason is None else fix.reason.name)
-                self._pose.extend((*fix.T_world_sensor.t_mm, *fix.T_world_sensor.R.ravel()))
+                reason, pose = "" if fix.reason is None else fix.reason.name, fix.T_world_sensor
                 self._mm.add(fix.residual_mm)
                 self._px.add(residual_px)
             case NoFix() as refusal:
-                self._reason.append(refusal.why.name)
-                self._pose.extend(_NOWHERE)
-        for stage, ms in (*step.timings_ms.items(), ("total", sum(step.timings_ms.values()))):
-            self._timings_ms[stage].append(ms)
+                reason = refusal.why.name
+        self._judged.add((reason, points, pose))
+        if reason:
+            self._reasons[reason] += 1
+        ms = {**step.timings_ms, "total": sum(step.timings_ms.values())}
+        self._timings_ms.add(tuple(ms.get(stage, np.nan) for stage in _TIMED))
+        for stage in ms:
+            self._timed[stage] += 1
         self._noise_scale = step.noise_scale
 
     def summary(
@@ -144,6 +158,7 @@ class Tally:
         adjusted: Adjusted | NotAdjusted | None = None,
     ) -> Summary:
         """The numbers so far, with the map as it now is, what is wrong with the rig and what came of the adjustment."""
+        timings_ms = np.array(self._timings_ms.items).reshape(-1, len(_TIMED))
         return Summary(
             recording=self._recording,
             level=self._level,
@@ -152,7 +167,8 @@ class Tally:
             frames=self._frames,
             positioned=self._positioned,
             refused=self._frames - self._positioned,
-            reasons=dict(Counter(filter(None, self._reason)).most_common()),
+            dropped=self._dropped,
+            reasons=dict(self._reasons.most_common()),
             targets={
                 state.name: int((targets.state == state).sum())
                 for state in (TargetState.trusted, TargetState.provisional, TargetState.quarantined)
@@ -162,9 +178,9 @@ class Tally:
             noise_scale=self._noise_scale,
             rig=rig,
             timings={
-                name: Timing(float(np.median(ms)), float(np.percentile(ms, 99)), len(ms))
-                for name, ms in self._timings_ms.items()
-                if ms
+                name: Timing(float(np.median(known)), float(np.percentile(known, 99)), self._timed[name])
+                for name, ms in zip(_TIMED, timings_ms.T, strict=True)
+                if len(known := ms[~np.isnan(ms)])
             },
             seconds=seconds,
             frames_per_s=self._frames / seconds if seconds > 0 else 0.0,
@@ -176,9 +192,9 @@ class Tally:
         )
 
     def _advice(self, targets: ReferenceMap) -> tuple[Tip, ...]:
-        rows = np.array(self._pose).reshape(-1, len(_NOWHERE))
-        poses = [None if np.isnan(row[0]) else Pose(row[3:].reshape(3, 3), row[:3]) for row in rows]
-        told = advice_for_run(self._reason, np.array(self._points, dtype=np.int64), poses, targets)
+        kept = self._judged.items
+        points = np.array([points for _, points, _ in kept], dtype=np.int64)
+        told = advice_for_run([reason for reason, _, _ in kept], points, [pose for _, _, pose in kept], targets)
         return tuple(Tip(each.sentence, None if each.place_mm is None else _rounded(each.place_mm)) for each in told)
 
 
@@ -192,7 +208,8 @@ class _Spread:
 
     def __init__(self) -> None:
         self._count, self._sum = 0, 0.0
-        self._frame_rms = array("d")
+        self._worst = 0.0
+        self._frame_rms: Thinned[float] = Thinned()
 
     def add(self, residual: Float[np.ndarray, "n"]) -> None:
         known = residual[np.isfinite(residual)]
@@ -201,15 +218,17 @@ class _Spread:
         squares = float((known**2).sum())
         self._count += len(known)
         self._sum += squares
-        self._frame_rms.append((squares / len(known)) ** 0.5)
+        rms = (squares / len(known)) ** 0.5
+        self._worst = max(self._worst, rms)
+        self._frame_rms.add(rms)
 
     def residuals(self) -> Residuals:
         if not self._count:
             return Residuals(None, None, None, 0)
         return Residuals(
             rms=(self._sum / self._count) ** 0.5,
-            median=float(np.median(self._frame_rms)),
-            worst=max(self._frame_rms),
+            median=float(np.median(self._frame_rms.items)),
+            worst=self._worst,
             count=self._count,
         )
 

@@ -1,11 +1,14 @@
-"""What the terminal says after a run. Knows a Summary, and neither Steps nor files."""
+"""What the terminal says during a live run and after any. Knows Status and Summary, and neither Steps nor files."""
 
+import math
+from collections.abc import Mapping
 from pathlib import Path
 
 from rich.console import Group, RenderableType
 from rich.table import Table
 from rich.text import Text
 
+from trifix.live import Status
 from trifix.outputs.summary import Summary
 from trifix.records import Reason
 
@@ -18,6 +21,8 @@ def summary_table(summary: Summary, report: Path) -> Group:
     table.add_column()
     share = f"{100 * summary.positioned / summary.frames:.1f} %" if summary.frames else ""
     table.add_row("positioned", Text(str(summary.positioned), "bold green"), f"of {summary.frames} frames  {share}")
+    if summary.dropped:
+        table.add_row("dropped", Text(str(summary.dropped), "yellow"), Text("came too fast to be judged", "dim"))
     for name, count in summary.reasons.items():
         is_refusal = name in Reason.__members__
         words = Reason[name].value if is_refusal else "positioned"
@@ -44,3 +49,19 @@ def summary_table(summary: Summary, report: Path) -> Group:
         advice.add_row(Text("→", "bold"), Text(tip.sentence))
     told: list[RenderableType] = [Text(), advice] if summary.advice else []
     return Group(table, *warning, *told, Text(), Text.assemble("report  ", (str(report), "bold")))
+
+
+def live_lines(statuses: Mapping[str, Status]) -> Group:
+    """How a live run goes, two lines a body, for ``rich`` to print again and again."""
+    lines = []
+    for body, status in statuses.items():
+        rates, colour = status.rates, {"green": "green", "amber": "yellow", "red": "red"}[status.light]
+        latency = f"{rates.latency_ms:.0f} ms" if math.isfinite(rates.latency_ms) else "–"
+        numbers = (
+            f"{rates.frames_per_s:5.1f} frames/s   latency {latency}   dropped {rates.dropped}   "
+            f"points {status.points}   matched {status.matched}"
+        )
+        name = f"{body}   " if len(statuses) > 1 else ""
+        lines.append(Text.assemble(("● ", f"bold {colour}"), name, numbers))
+        lines.append(Text(f"  {status.sentence}", colour))
+    return Group(*lines)

@@ -123,6 +123,7 @@ _FEW = 0.05  # share of a frame's targets that may reach it: where more do, the 
 _CLEAR_SIGMAS = 6.0  # two targets are clearly apart beyond this, were the covariances right
 _EXACT_MM2 = 1e-12  # what a covariance of zero is taken for
 _AT_MOST = 3.0  # standard deviations that the farthest place stands for which can be reached at the pace that was
+_SWEEP = 1000  # lessons between two sweeps of what is remembered of targets that are gone
 _CROWD = 2  # witnesses to each target that has moved: where more go together, it is the map that drifted
 
 
@@ -168,6 +169,8 @@ class Care:
         if not options.tends:
             return map, []
         self._lessons += 1
+        if self._lessons % _SWEEP == 0:
+            self._forget_gone(map)
         self._grow(len(map))
         seen, pose = fix.target, fix.T_world_sensor
         changed = map.misses != self._misses[: len(map)]
@@ -213,6 +216,12 @@ class Care:
             ),
             maxlen=self._options.remembered,
         )
+
+    def _forget_gone(self, map: ReferenceMap) -> None:
+        """Drops what is remembered of targets that no row of the map holds any more."""
+        here = set(map.id.tolist())
+        self._arrived &= here
+        self._turns = {pair: turns for pair, turns in self._turns.items() if here.issuperset(pair)}
 
     def _grow(self, rows: int) -> None:
         if rows <= len(self._count):
