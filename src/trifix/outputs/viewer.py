@@ -407,7 +407,7 @@ class _Page:
         self._scene = self._server.scene
         self._is_dark = False
         self._targets = ReferenceMap.empty()
-        self._extent_mm = 0.0
+        self._extent_mm = self._radius_mm = 0.0
         self._is_magnification_chosen = False
         self._hidden: set[str] = set()
         self._path_mm = np.zeros((0, 3))
@@ -668,13 +668,13 @@ class _Page:
         extent = float(np.linalg.norm(high - low))
         if not 0.8 * self._extent_mm < extent < 1.25 * self._extent_mm:
             self._extent_mm = max(extent, 1.0)
+            some = shown[:: len(shown) // 200 + 1]
+            apart = np.linalg.norm(some[:, None] - shown[None], axis=2)
+            gap = float(np.median(np.partition(apart, 1, axis=1)[:, 1])) if len(shown) > 1 else np.inf
+            self._radius_mm = float(np.clip(0.35 * gap, 0.006 * self._extent_mm, 0.02 * self._extent_mm))
         if not self._is_magnification_chosen:
             best = default_magnification(self._targets.cov_mm2[self._targets.state == TargetState.trusted], extent)
             self._magnify.value = _times(best)  # type: ignore[misc]  # as above
-
-    @property
-    def _radius_mm(self) -> float:
-        return 0.02 * self._extent_mm
 
     def _draw_ellipsoids(self) -> None:
         factor = _MAGNIFICATIONS[[_times(each) for each in _MAGNIFICATIONS].index(self._magnify.value)]
@@ -683,7 +683,9 @@ class _Page:
             wxyz, sigma = ellipsoids(self._targets.cov_mm2[rows])
             handle.batched_positions = _metres(self._targets.xyz_mm[rows])
             handle.batched_wxyzs = wxyz.astype(np.float32)
-            handle.batched_scales = _metres(np.clip(factor * sigma, 1e-3, 0.25 * self._extent_mm))
+            shown = np.maximum(factor * sigma, 1e-3)
+            largest = shown.max(axis=1, keepdims=True, initial=1e-3)
+            handle.batched_scales = _metres(shown * np.minimum(0.1 * self._extent_mm / largest, 1.0))
 
     def _draw_words(self, moment: Moment, frames_per_s: float, latency_ms: float, dropped: int) -> None:
         self._status.content = panels.status(moment)
