@@ -36,9 +36,17 @@ from trifix.records import (
     SensorPoints,
     SingleDots,
     Step,
+    StereoDots,
     TargetState,
 )
-from trifix.stages.triangulate import triangulate
+from trifix.stages.triangulate import (
+    NORMAL_SIGMA,
+    NORMALS,
+    Circles,
+    centres_by_normals,
+    circles_of,
+    triangulate,
+)
 from trifix.stages.verify import pose_sigma
 
 _ROUNDS = 3  # of adjusting: with more dots, and by the noise that the residuals show
@@ -51,6 +59,11 @@ _HOLDING = 3  # trusted targets that hold a pose without the others
 _GROWTHS = np.arange(0.0, 3.01, 0.25)  # exponents by which dots may be the noisier the smaller they look
 _SMALLEST = 0.5  # apparent size, as a share of the largest, below which nothing more is said
 _LARGEST_PERCENT = 95.0  # of all apparent sizes: that of a target seen straight on
+_SIGHTINGS_OF_NORMAL = 4  # at least, before a normal is believed
+_TRIED = 40  # sightings whose normals are tried
+_LEAST_NORMAL_RAD = 0.05  # so well do normals agree at best
+_OTHER_RAD = 0.3  # normals farther apart are different
+_DISSENT = 0.01  # share of sightings that agree with nothing
 _DECISIVE = 20.0  # of twice a logarithm of likelihoods
 
 
@@ -162,10 +175,11 @@ class _Sightings:
 
     def and_also(self, more: "_Sightings") -> "_Sightings":
         """These and others."""
-        pairs = zip(self._columns(), more._columns(), strict=True)
+        pairs = zip(self.columns(), more.columns(), strict=True)
         return _Sightings(*(np.concatenate(pair) for pair in pairs))
 
-    def _columns(self) -> tuple[np.ndarray, ...]:
+    def columns(self) -> tuple[np.ndarray, ...]:
+        """In the order of the fields."""
         return self.frame, self.target, self.camera, self.row
 
     @staticmethod
@@ -418,11 +432,57 @@ class _Bundle:
             self._count += out.steps
             if k == _ROUNDS - 1:
                 break
+            is_settled = k == 0 and self._has_dots and self._settle_centres()
             more = self._found() if k == 0 and self._has_dots else _Sightings.joined([])
             is_news = self._learn_noise(is_noise_stated)
-            if not is_news and not len(more):
+            if not is_news and not is_settled and not len(more):
                 break
             self._seen = self._seen.and_also(more)
+
+    def _settle_centres(self) -> bool:
+        """Moves dots to their targets' centres by the normals that all frames together give; whether any moved.
+
+        An ellipse has two answers, and a dot that one camera alone saw leaves open which is right. Over many frames,
+        the right ones are the same normal of the target in the world; the others lie about.
+        """
+        if not self._config.triangulate.correct_eccentricity:
+            return False
+        by_frame = self._seen.of(np.argsort(self._seen.frame, kind="stable"))
+        frame, target, camera, row = by_frame.columns()
+        start = np.searchsorted(frame, np.arange(len(self._placed) + 1))
+        normal, sigma = np.full((len(frame), 2, 3), np.nan), np.full(len(frame), np.inf)
+        circles: list[tuple[Circles, Circles]] = []
+        for k, step in enumerate(self._placed):
+            rig = self._rig(k)
+            assert step.dots is not None
+            assert rig is not None
+            circles.append(circles_of(step.dots, rig, self._scale))
+            for side, R in enumerate(_rotations(rig, self._T[k])):
+                own = start[k] + np.flatnonzero(camera[start[k] : start[k + 1]] == side)
+                seen = circles[k][side][row[own]]
+                normal[own] = seen[:, NORMALS].reshape(-1, 2, 3) @ R.T
+                sigma[own] = seen[:, NORMAL_SIGMA]
+        of_target = np.full((len(self._map), 3), np.nan)
+        for each in np.unique(target).tolist():
+            own = np.flatnonzero((target == each) & np.isfinite(sigma))
+            of_target[each] = _common_normal(normal[own], sigma[own])
+        if not np.isfinite(of_target).any():
+            return False
+        for k, step in enumerate(self._placed):
+            rig, dots, centres = self._rig(k), step.dots, step.centres
+            assert rig is not None
+            assert dots is not None
+            assert centres is not None
+            moved = []
+            for side, (R, own_dots, own_centres) in enumerate(
+                zip(_rotations(rig, self._T[k]), (dots.left, dots.right), (centres.left, centres.right), strict=True)
+            ):
+                own = start[k] + np.flatnonzero(camera[start[k] : start[k + 1]] == side)
+                facing = np.full((len(own_dots), 3), np.nan)
+                facing[row[own]] = of_target[target[own]] @ R
+                moved.append(centres_by_normals(own_dots, own_centres, circles[k][side], facing, self._scale))
+            self._placed[k] = replace(step, centres=StereoDots(*moved))
+        return True
 
     def _rig(self, k: int) -> StereoRig | None:
         """The rig of a positioned frame, as refined where it was."""
@@ -477,7 +537,8 @@ class _Bundle:
         is_in = self._out.is_target_adjusted
         cov[self._rows[is_in]] = self._out.target_cov_mm2[is_in]
         self._place_the_others(xyz, cov)
-        map = replace(self._map, xyz_mm=xyz, cov_mm2=cov, view=self._map.view @ self._T_world_map.R.T)
+        view, joint = self._map.view @ self._T_world_map.R.T, self._joint(cov)
+        map = replace(self._map, xyz_mm=xyz, cov_mm2=cov, view=view, joint_mm2=joint)
         scale = self._typical_scale()
         left_out = self._placed_anew()
         new = self._seen.of(np.arange(len(self._seen)) >= self._identified)
@@ -490,12 +551,24 @@ class _Bundle:
         for step in self._steps:
             if isinstance(step.fix, Fix):
                 more = new.of(np.arange(start[k], start[k + 1]))
-                done.append(replace(self._applied(k, step, step.fix, map, more, left_out), noise_scale=scale))
+                done.append(
+                    replace(self._applied(k, self._placed[k], step.fix, map, more, left_out), noise_scale=scale)
+                )
                 k += 1
             else:
                 moved, frame = self._moved(step.fix), self._with_rig(step.frame)
                 done.append(replace(step, frame=frame, fix=moved, map=map, noise_scale=scale))
         return done
+
+    def _joint(self, cov_mm2: Float[np.ndarray, "k 3 3"]) -> Float[np.ndarray, "k3 k3"]:
+        """Covariance of all targets together; those that were not adjusted are known each for itself."""
+        k, rows = len(cov_mm2), self._rows[self._out.is_target_adjusted]
+        joint = np.zeros((3 * k, 3 * k))
+        joint.reshape(k, 3, k, 3)[np.arange(k), :, np.arange(k)] = cov_mm2
+        to = (3 * rows[:, None] + np.arange(3)).ravel()
+        of = (3 * np.flatnonzero(self._out.is_target_adjusted)[:, None] + np.arange(3)).ravel()
+        joint[np.ix_(to, to)] = self._out.map_cov_mm2[np.ix_(of, of)]
+        return joint
 
     def _applied(
         self,
@@ -632,6 +705,36 @@ class _Bundle:
             rig_sigma=dict(zip(out.rig_parameters, sigma.tolist(), strict=True)),
             rig_change_sigmas=change,
         )
+
+
+def _rotations(rig: StereoRig, T_world_sensor: Pose) -> tuple[Float[np.ndarray, "3 3"], Float[np.ndarray, "3 3"]]:
+    """R_world_camera of both cameras."""
+    return T_world_sensor.R, T_world_sensor.R @ rig.T_right_left.R.T
+
+
+def _common_normal(normal: Float[np.ndarray, "s 2 3"], sigma_rad: Float[np.ndarray, "s"]) -> Float[np.ndarray, "3"]:
+    """The normal with which one of the two answers of most sightings agrees; NaN for none, or for more than one."""
+    unknown = np.full(3, np.nan)
+    if len(normal) < _SIGHTINGS_OF_NORMAL:
+        return unknown
+    variance = sigma_rad**2 + _LEAST_NORMAL_RAD**2
+
+    def agreement(n: Float[np.ndarray, "c 3"]) -> Float[np.ndarray, "c s"]:
+        apart2 = ((normal[None] - n[:, None, None]) ** 2).sum(axis=3).min(axis=2)
+        return np.asarray(np.exp(-0.5 * apart2 / variance))
+
+    tried = normal[np.linspace(0, len(normal) - 1, min(len(normal), _TRIED)).astype(int)].reshape(-1, 3)
+    support = np.log(_DISSENT + agreement(tried)).sum(axis=1)
+    best = tried[support.argmax()]
+    other = np.linalg.norm(tried - best, axis=1) > _OTHER_RAD
+    if support[other].max(initial=-np.inf) > support.max() - _DECISIVE:
+        return unknown
+    for _ in range(3):
+        nearer = ((normal - best) ** 2).sum(axis=2).argmin(axis=1)
+        weight = agreement(best[None])[0] / variance
+        best = (normal[np.arange(len(normal)), nearer] * weight[:, None]).sum(axis=0)
+        best /= np.linalg.norm(best)
+    return best if agreement(best[None])[0].mean() > 0.5 else unknown
 
 
 def _off(

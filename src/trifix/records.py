@@ -210,9 +210,25 @@ class ReferenceMap:
     """Frames that should have seen it and did not."""
     state: Int[np.ndarray, "k"]
     """A ``TargetState``."""
+    joint_mm2: Float[np.ndarray, "k3 k3"] | None = None
+    """Covariance of all positions together (mm²), where the map was adjusted as a whole; its blocks are ``cov_mm2``."""
 
     def __len__(self) -> int:
         return len(self.id)
+
+    def distance(self, a: int, b: int) -> tuple[float, float]:
+        """Distance of the targets in two rows, and its standard deviation (mm).
+
+        Where nothing is known of what their errors have in common, they are taken for independent.
+        """
+        offset = self.xyz_mm[a] - self.xyz_mm[b]
+        length_mm = float(np.linalg.norm(offset))
+        cov = self.cov_mm2[a] + self.cov_mm2[b]
+        if self.joint_mm2 is not None:
+            cross = self.joint_mm2[3 * a : 3 * a + 3, 3 * b : 3 * b + 3]
+            cov = cov - cross - cross.T
+        along = offset / max(length_mm, 1e-300)
+        return length_mm, float(np.sqrt(max(along @ cov @ along, 0.0)))
 
     @property
     def alive(self) -> Bool[np.ndarray, "k"]:
@@ -230,6 +246,7 @@ class ReferenceMap:
             self.last_seen[rows],
             self.misses[rows],
             self.state[rows],
+            None if self.joint_mm2 is None else _blocks_of(self.joint_mm2, rows),
         )
 
     def copy(self) -> "ReferenceMap":
@@ -262,6 +279,11 @@ class ReferenceMap:
             misses=np.zeros(k, dtype=np.int64),
             state=np.full(k, int(TargetState.trusted)) if state is None else state,
         )
+
+
+def _blocks_of(joint: Float[np.ndarray, "k3 k3"], rows: Int[np.ndarray, "r"]) -> Float[np.ndarray, "r3 r3"]:
+    entries = (3 * rows[:, None] + np.arange(3)).ravel()
+    return joint[np.ix_(entries, entries)]
 
 
 @dataclass(frozen=True, slots=True)

@@ -50,6 +50,15 @@ class TriangulateOptions:
             )
 
 
+Circles = Float[np.ndarray, "_ 12"]
+"""What ellipses say of the circles that they show: a row each, as `kernels.stereo.views_of_circles` has it."""
+NORMALS = slice(4, 10)
+"""Columns of both answers for the normal, camera coordinates; NaN where only a size is known."""
+NORMAL_SIGMA = 11
+"""Column of the standard deviation of either (rad)."""
+_SOME_OTHER = 1e-6  # likelihood of a circle that faces neither way
+
+
 def correct_eccentricity(
     dots: StereoDots, matches: StereoMatches, rig: StereoRig, noise_scale: float = 1.0
 ) -> StereoDots:
@@ -59,12 +68,37 @@ def correct_eccentricity(
     pairs agree in neither, get the mean of both, and a covariance with their spread. ``noise_scale`` multiplies the
     dots' standard deviations, as it will afterwards: what does not grow with the noise is stated accordingly.
     """
-    parameters = rig.parameters
-    left = _views(dots.left, parameters[:12], noise_scale)
-    right = _views(dots.right, parameters[12:24], noise_scale)
-    likelihoods = weigh_answers(left, right, integers(matches.left), integers(matches.right), parameters)
+    left, right = circles_of(dots, rig, noise_scale)
+    likelihoods = weigh_answers(left, right, integers(matches.left), integers(matches.right), rig.parameters)
     return StereoDots(
         _shifted(dots.left, left, likelihoods[0], noise_scale), _shifted(dots.right, right, likelihoods[1], noise_scale)
+    )
+
+
+def circles_of(dots: StereoDots, rig: StereoRig, noise_scale: float) -> tuple[Circles, Circles]:
+    """What the ellipses of either camera say of the circles that they show."""
+    parameters = rig.parameters
+    return _views(dots.left, parameters[:12], noise_scale), _views(dots.right, parameters[12:24], noise_scale)
+
+
+def centres_by_normals(
+    dots: Dots, centres: Dots, circles: Circles, normal: Float[np.ndarray, "n 3"], noise_scale: float
+) -> Dots:
+    """The dots at the images of their targets' centres, of targets whose normals are known; ``centres`` elsewhere.
+
+    Normals are in camera coordinates, away from the object, NaN where unknown.
+    """
+    known = np.isfinite(normal).all(axis=1) & np.isfinite(circles[:, NORMAL_SIGMA])
+    if not known.any():
+        return centres
+    apart2 = ((circles[:, NORMALS].reshape(-1, 2, 3) - normal[:, None]) ** 2).sum(axis=2)
+    with np.errstate(invalid="ignore"):
+        likelihood = np.exp(-0.5 * apart2 / circles[:, NORMAL_SIGMA, None] ** 2) + _SOME_OTHER
+    by_normal = _shifted(dots, circles, floats(np.where(known[:, None], likelihood, 1.0)), noise_scale)
+    return replace(
+        centres,
+        uv_px=np.where(known[:, None], by_normal.uv_px, centres.uv_px),
+        cov_px2=np.where(known[:, None, None], by_normal.cov_px2, centres.cov_px2),
     )
 
 
