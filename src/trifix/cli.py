@@ -483,6 +483,59 @@ def paper(
 
 
 @app.command(sort_key=5)
+def acceptance(
+    *,
+    out: Out,
+    recordings: int = 2,
+    seed: int = 1,
+    frames: int = 800,
+    bars: Literal[0, 1, 2] = 2,
+    limit_mm: float = 0.015,
+    limit_mm_per_m: float = 0.015,
+    json: Json = False,
+) -> None:
+    """Measure the test lengths of a simulated artefact: a virtual acceptance test after VDI/VDE 2634 part 1.
+
+    Args:
+        out: Folder for the page, the figure and the table of lengths.
+        recordings: Recordings to simulate, each of another hand and other noise.
+        seed: Of the first of them; the others follow.
+        frames: Number of frames of each.
+        bars: Scale bars to use.
+        limit_mm: Error that is permitted to any length (mm).
+        limit_mm_per_m: What is permitted besides, per metre of length (mm).
+    """
+    import numpy as np
+
+    from trifix.experiments.acceptance import Limit, run_acceptance
+    from trifix.experiments.acceptance_page import acceptance_rows, write_acceptance
+
+    if min(recordings, frames) < 1 or seed < 0 or not 0 < limit_mm < math.inf or not 0 <= limit_mm_per_m < math.inf:
+        raise CycloptsError(msg="--recordings and --frames must be at least 1, --seed and the limits not negative.")
+    with progress_bar() as progress:
+        tasks: dict[str, TaskID] = {}
+
+        def show(part: str, done: int, of: int) -> None:
+            if part not in tasks:
+                tasks[part] = progress.add_task(part, total=of)
+            progress.update(tasks[part], completed=done)
+
+        seeds = np.arange(seed, seed + recordings)
+        found = run_acceptance(seeds, frames, bars, Limit(limit_mm, limit_mm_per_m), show=show)
+    page = write_acceptance(found, out, shlex.join(["trifix", *sys.argv[1:]]))
+    record = {
+        "lengths": found.lengths,
+        "limit": found.limit,
+        "exceeding": found.exceeding,
+        "missing": found.missing,
+        "largest_mm": found.largest_mm,
+        "normalised_rms": found.normalised_rms,
+        "page": page,
+    }
+    answer(record, json, lambda: table_of([*acceptance_rows(found), ("page", str(page))]))
+
+
+@app.command(sort_key=6)
 def config(*, config: Path | None = None, settings: Settings = (), json: Json = False) -> None:
     """Print the options in effect, each with its meaning, as TOML.
 
@@ -496,7 +549,7 @@ def config(*, config: Path | None = None, settings: Settings = (), json: Json = 
     answer(tomllib.loads(options), json, lambda: print(options, end=""))
 
 
-@app.command(sort_key=6)
+@app.command(sort_key=7)
 def warmup(*, json: Json = False) -> None:
     """Compile the inner loops, once for this machine, so that the first frame need not wait for it."""
     names = _compile()

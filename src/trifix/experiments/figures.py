@@ -17,6 +17,7 @@ from matplotlib.collections import PolyCollection
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
+from trifix.experiments.acceptance import Acceptance
 from trifix.experiments.measuring import Part, growth, slope
 from trifix.records import ReferenceMap
 from trifix.stages.identify.congruence import IdentifyOptions
@@ -92,6 +93,34 @@ def for_page(svg: str) -> str:
     for colour, name in _VARIABLES.items():
         svg = svg.replace(colour, f"var(--{name})")
     return svg
+
+
+# --- acceptance ------------------------------------------------------------------------------------------------------
+
+
+def lengths_figure(found: Acceptance) -> Figure:
+    """Error of each test length against the length, with the band that is permitted and twice the predicted sigma."""
+    length, error, sigma = (
+        np.array([getattr(each, name) for each in found.lengths]) for name in ("length_mm", "error_mm", "sigma_mm")
+    )
+    with mpl.rc_context(_STYLE):  # type: ignore[arg-type]
+        figure = Figure(figsize=(11, 4.4), layout="constrained")
+        axes = figure.subplots()
+        ends = np.array([0.0, 1.04 * length.max(initial=1.0)])
+        limit = np.array([found.limit.at(end) for end in ends])
+        axes.fill_between(ends, -limit, limit, color=_SOFT, linewidth=0, label="permitted")
+        axes.axhline(0, color=_GRID, linewidth=0.8)
+        axes.errorbar(
+            length, error, 2 * sigma, fmt="none", ecolor=_FAINT, elinewidth=0.7, alpha=0.6, label="± 2 predicted sigma"
+        )
+        is_over = np.abs(error) > found.limit.constant_mm + found.limit.slope_mm_m * length / 1000
+        axes.plot(length[~is_over], error[~is_over], "o", ms=4, mfc=_GOOD, mec="none", label="within")
+        if is_over.any():
+            axes.plot(length[is_over], error[is_over], "D", ms=5, mfc=_BAD, mec="none", label="beyond")
+        axes.set(xlim=ends, xlabel="true length (mm)", ylabel="measured less true (mm)")
+        axes.grid(axis="x", visible=False)
+        figure.legend(*axes.get_legend_handles_labels(), loc="outside lower center", ncols=4)
+        return figure
 
 
 # --- 4-2 -------------------------------------------------------------------------------------------------------------

@@ -462,6 +462,39 @@ def _demo(n: int, layout: np.random.Generator, hand: np.random.Generator) -> Sce
     return Scene(surface, _still(xyz, normal, n), rig, poses)
 
 
+LINES_MM = (
+    ((60.0, 500.0, 40.0), (940.0, 500.0, 40.0)),
+    ((500.0, 60.0, 60.0), (500.0, 940.0, 60.0)),
+    ((70.0, 90.0, 90.0), (930.0, 910.0, 90.0)),
+    ((70.0, 910.0, 120.0), (930.0, 90.0, 120.0)),
+    ((60.0, 150.0, 20.0), (940.0, 850.0, 300.0)),
+    ((60.0, 850.0, 300.0), (940.0, 150.0, 20.0)),
+    ((60.0, 300.0, 300.0), (940.0, 300.0, 20.0)),
+    ((300.0, 60.0, 20.0), (300.0, 940.0, 300.0)),
+)
+"""Ends of the artefact's measuring lines, in eight directions through a volume of 1 x 1 x 0.3 m (mm)."""
+ON_A_LINE = 6
+"""Targets on each, evenly spaced: five test lengths from its first."""
+BARS_MM = (((90.0, 20.0, 50.0), (910.0, 20.0, 50.0)), ((20.0, 90.0, 50.0), (20.0, 910.0, 50.0)))
+"""Ends of its two scale bars (mm)."""
+
+
+def _artefact(n: int, layout: np.random.Generator, hand: np.random.Generator) -> Scene:
+    """Targets on posts over a plate of others; first come those of the lines, then the ends of the bars."""
+    rig = _rig(crossing_mm=550)
+    plate = rectangle((0, 0, 0), (1000, 0, 0), (0, 1000, 0))
+    share = np.linspace(0, 1, ON_A_LINE)[:, None]
+    posts = [(1 - share) * np.array(a) + share * np.array(b) for a, b in LINES_MM]
+    ends = [np.array(bar) for bar in BARS_MM]
+    xyz, normal = plate.scatter(130, layout)
+    raised = np.concatenate([*posts, *ends])
+    xyz = np.concatenate([raised, xyz])
+    normal = np.concatenate([np.tile([0.0, 0.0, 1.0], (len(raised), 1)), normal])
+    aim = _lanes(np.arange(n) / n, (80, 920), (80, 920), 5) + np.array([0.0, 0.0, 120.0])
+    sensing = Sensing(depth_mm=(200, 800), sigma_px=0.03)
+    return Scene(plate, _still(xyz, normal, n), rig, _over(rig, hand, aim, 450), diameter_mm=8.0, sensing=sensing)
+
+
 def _relief(width_mm: float, depth_mm: float) -> Surface:
     """A landscape of gentle hills."""
 
@@ -487,5 +520,6 @@ SCENES: dict[str, Recipe] = {
     "dwell": Recipe("long over one region, then over all: misleads frequency counts", 1000, _dwell),
     "closure": Recipe("once round and a little more: misleads frequency counts", 1000, _closure),
     "sparse": Recipe("30 targets and wide gaps: often fewer than three for both cameras", 1000, _sparse),
+    "artefact": Recipe("test lengths in eight directions through 1 x 1 x 0.3 m, dots good to 0.03 px", 800, _artefact),
     "demo": Recipe("a head with 44 targets, a short quiet tour, made to be rendered", 60, _demo),
 }
