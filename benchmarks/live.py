@@ -67,9 +67,7 @@ def main(frames: int = 300, rounds: int = 3, targets: int = 30, clip: int = 60) 
         module.warm_up()
     rig, pairs = drawn(targets, clip)
     coded = [tuple(cv2.imencode(".jpg", each, [cv2.IMWRITE_JPEG_QUALITY, 92])[1] for each in pair) for pair in pairs]
-    table = Table(
-        "30 targets, 1280 x 1024 x 2" if targets == 30 else f"{targets} targets", "bare", "trifix", "ratio", ""
-    )
+    table = Table(f"{targets} targets, 1280 x 1024 x 2", "bare", "trifix", "ratio")
     for name, clip_of, decode in (("JPEG", coded, True), ("decoded already", pairs, False)):
         bare, ours = [], []
         for _ in range(rounds):
