@@ -214,3 +214,19 @@ def test_a_pose_that_single_dots_carry_owes_the_map_what_its_targets_share():
     assert np.trace(cov) > np.trace(own)
     assert cov[0, 0] < 30 * np.trace(absolute)
     assert np.linalg.eigvalsh(cov - own)[0] > -1e-12
+
+
+def test_the_told_map_has_the_errors_that_all_targets_share():
+    walk = Walk(strip(np.random.default_rng(1), 60), np.random.default_rng(2), 30)
+    for x_mm in np.linspace(0, 900, 12):
+        walk.see(*along(walk.world, float(x_mm)))
+    told = walk.joint.told(walk.map)
+    whole = walk.joint.covariance(np.arange(len(walk.map)))
+    for row in (0, len(told) // 2, len(told) - 1):
+        block = whole[3 * row : 3 * row + 3, 3 * row : 3 * row + 3]
+        np.testing.assert_allclose(told.cov_mm2[row], block, rtol=1e-9)
+    assert np.trace(told.cov_mm2[-1]) > 2 * np.trace(walk.map.cov_mm2[-1])
+    assert told.xyz_mm is walk.map.xyz_mm
+    error = walk.errors_of_targets()
+    nees = np.einsum("ni,nij,nj->n", error, np.linalg.inv(told.cov_mm2), error) / 3
+    assert 0.1 < np.mean(nees) < 2.5

@@ -205,6 +205,10 @@ class Island:
         residual_mm = np.linalg.norm(self.map.xyz_mm[fix.target] - T.apply(points.xyz_mm[fix.point]), axis=1)
         return replace(fix, T_world_sensor=T, cov=cov, residual_mm=residual_mm)
 
+    def told_map(self) -> ReferenceMap:
+        """The map by all that is known of it, as ``told`` has the fixes; with storage of its own."""
+        return (self.map if self._joint is None else self._joint.told(self.map)).copy()
+
     def rescale(self, ratio: float) -> None:
         """Follows a change of the noise scale: all covariances are in proportion to its square."""
         if self._joint is not None:

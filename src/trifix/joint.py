@@ -10,7 +10,7 @@ Lives beside the map and moves its targets; world coordinates are exact by defin
 given map has them. Knows no image and no matching.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -123,6 +123,14 @@ class JointMap:
         for k in range(len(rows)):
             C[3 * k : 3 * k + 3, 3 * k : 3 * k + 3] += own[k]
         return np.asarray(C)
+
+    def told(self, map: ReferenceMap) -> ReferenceMap:
+        """The map with each target's covariance in the world, of which what all errors have in common is a part."""
+        self.follow(map)
+        cov_mm2 = map.cov_mm2.copy()
+        for row in np.flatnonzero(self._id[: len(map)] >= 0).tolist():
+            cov_mm2[row] = self.covariance(np.array([row]))
+        return replace(map, cov_mm2=cov_mm2)
 
     def rescale(self, ratio: float) -> None:
         """Follows a change of the noise scale: all covariances are in proportion to its square."""

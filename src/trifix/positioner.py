@@ -111,6 +111,10 @@ class Positioner:
         """The world's targets as they are known now; copy it to keep it."""
         return self._world.map
 
+    def told_map(self) -> ReferenceMap:
+        """The same targets with covariances in the world, the errors that all of them share included."""
+        return self._world.told_map()
+
     @property
     def identifier(self) -> Identifier:
         """The matching technique, with its memory of the world."""

@@ -34,6 +34,16 @@ def written(out: Path, level: Level, made: list[Step]) -> Summary:
         return results.finish()
 
 
+def test_the_map_may_be_told_by_more_than_the_last_step_knows(tmp_path: Path):
+    made = list(steps(5, "points"))
+    told = replace(made[-1].map, cov_mm2=4 * made[-1].map.cov_mm2)
+    with ResultsWriter(tmp_path / "out", "plate", "points", OPTIONS, is_online=True) as results:
+        for step in made:
+            results.write(step)
+        results.finish(told_map=told)
+    np.testing.assert_allclose(read_map(tmp_path / "out" / "map.csv").cov_mm2, told.cov_mm2, atol=1e-6)
+
+
 def rows(path: Path) -> list[dict[str, str]]:
     with path.open(newline="") as file:
         return list(csv.DictReader(file))

@@ -185,12 +185,17 @@ class ResultsWriter:
         """What seems to be wrong with the rig so far; empty if nothing does."""
         return self._rig_check.sentence
 
-    def finish(self, adjusted: Adjusted | NotAdjusted | None = None) -> Summary:
+    def finish(self, adjusted: Adjusted | NotAdjusted | None = None, told_map: ReferenceMap | None = None) -> Summary:
         """Close the files of a run that reached its end; what it amounts to, and its adjustment if there was one.
+
+        ``told_map`` is the last Step's map with covariances in the world, as ``Positioner.told_map`` gives it.
 
         Raises:
             RecordingError: something could not be written.
         """
+        if told_map is not None:
+            with self._lock:
+                self._map = told_map
         self._rig_check.finish()
         self._is_finished, self._adjusted = True, adjusted
         self._close()
