@@ -4,7 +4,7 @@ import csv
 import inspect
 import io
 import json
-import os
+import re
 import shutil
 import signal
 import subprocess
@@ -191,9 +191,17 @@ def commands(app: App, path: tuple[str, ...] = ()) -> Iterator[tuple[str, App]]:
         yield " ".join(path), app
 
 
+def test_the_readme_lists_every_command_in_the_order_of_the_help() -> None:
+    readme = (Path(__file__).parent.parent / "README.md").read_text(encoding="utf-8")
+    listed = re.findall(r"^\| `trifix ([a-z]+(?: paper)?)", readme, re.MULTILINE)
+    assert listed == [name for name, _ in commands(cli.app)]
+    shown = re.findall(r"^│ ([a-z]+) ", trifix("--help").stdout, re.MULTILINE)
+    assert shown == [name.split()[0] for name in listed]
+
+
 def test_every_command_can_answer_in_json():
     found = dict(commands(cli.app))
-    assert {"run", "simulate", "demo", "evaluate", "compare", "experiment paper", "config", "warmup"} <= found.keys()
+    assert {"demo", "run", "live", "view", "experiment paper", "warmup"} <= found.keys()
     for name, command in found.items():
         assert command.default_command is not None
         option = inspect.signature(command.default_command).parameters.get("json")
@@ -278,52 +286,6 @@ def test_the_summary_knows_the_name_of_the_folder_one_is_in(tmp_path: Path, monk
     monkeypatch.chdir(SMALL / "recording")
     assert trifix("run", ".", "-o", tmp_path / "out").code == 0
     assert json.loads((tmp_path / "out" / "summary.json").read_text(encoding="utf-8"))["recording"] == "recording"
-
-
-def test_compiled_code_goes_among_temporary_files_only_where_it_has_no_other_place(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setenv("NUMBA_CACHE_DIR", "unset")
-    monkeypatch.delenv("NUMBA_CACHE_DIR")
-    monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
-    cli._find_room_for_compiled_code()
-    assert "NUMBA_CACHE_DIR" not in os.environ
-    monkeypatch.setattr(cli, "_can_be_written", lambda folder: False)
-    cli._find_room_for_compiled_code()
-    room = Path(os.environ.pop("NUMBA_CACHE_DIR"))
-    assert (room.parent, room.stat().st_mode & 0o077) == (tmp_path, 0)
-    room.chmod(0o777)  # somebody else could have put code there
-    cli._find_room_for_compiled_code()
-    assert Path(os.environ["NUMBA_CACHE_DIR"]) != room
-    assert Path(os.environ["NUMBA_CACHE_DIR"]).parent == tmp_path
-
-
-def test_a_folder_can_be_written_if_its_nearest_parent_can(tmp_path: Path) -> None:
-    assert cli._can_be_written(tmp_path / "a" / "b")
-    (tmp_path / "file").touch()
-    assert not cli._can_be_written(tmp_path / "file" / "b")
-
-
-def test_an_interrupt_is_found_behind_other_errors() -> None:
-    inner, outer = ValueError(), SystemError()
-    inner.__context__ = KeyboardInterrupt()
-    outer.__cause__ = inner
-    assert cli._comes_of_interrupt(outer)
-    assert not cli._comes_of_interrupt(SystemError())
-
-
-def test_a_second_interrupt_ends_at_once() -> None:
-    program = (
-        "import signal, trifix.cli\n"
-        "with trifix.cli._between_frames():\n"
-        "    signal.raise_signal(signal.SIGINT)\n"
-        "    print('waits', flush=True)\n"
-        "    signal.raise_signal(signal.SIGTERM)\n"
-        "    print('goes on', flush=True)\n"
-    )
-    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=False)
-    assert (done.returncode, done.stdout) == (130, "waits\n")
-    assert done.stderr == f"trifix: {cli._INTERRUPTED}\n"
 
 
 def test_a_simulated_recording_can_be_positioned(tmp_path: Path) -> None:

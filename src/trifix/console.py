@@ -5,7 +5,8 @@ result twice: the record that programs read, and how it looks to people. Nothing
 command, and loads no numerics.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Annotated
 
@@ -18,6 +19,7 @@ from rich.progress import (
     Progress,
     ProgressColumn,
     Task,
+    TaskID,
     TextColumn,
     TimeRemainingColumn,
 )
@@ -79,3 +81,22 @@ def progress_bar(unit: str = "frames") -> Progress:
         TimeRemainingColumn(elapsed_when_finished=True),
         console=Console(stderr=True),
     )
+
+
+@contextmanager
+def progress_bars(unit: str = "frames", keeps_finished: bool = True) -> Iterator[Callable[[str, int, int], None]]:
+    """A progress bar for each part that is told of: its name, how much is done, of how much.
+
+    The first appears with the first word of a part, so that a refusal before it stands alone.
+    """
+    progress, tasks = progress_bar(unit), dict[str, TaskID]()
+    with ExitStack() as shown:
+
+        def show(part: str, done: int, of: int) -> None:
+            if not progress.live.is_started:
+                shown.enter_context(progress)
+            if part not in tasks:
+                tasks[part] = progress.add_task(part)
+            progress.update(tasks[part], completed=done, total=of, visible=keeps_finished or done < of)
+
+        yield show
