@@ -8,10 +8,11 @@ from trifix.files.recordings import Recording, read_recording
 from trifix.geometry.camera import Camera, StereoRig
 from trifix.geometry.pose import Pose
 from trifix.live import Live
+from trifix.offline import Positions, position
 from trifix.outputs.publish import Publisher
 from trifix.outputs.report import Report
 from trifix.outputs.results import ResultsWriter
-from trifix.positioner import Positioner, Positions, position
+from trifix.positioner import Positioner
 from trifix.records import (
     Dots,
     Fix,

@@ -7,18 +7,15 @@ from collections.abc import Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import partial
-from pathlib import Path
 from time import perf_counter
 from typing import assert_never
 
 import numpy as np
-from jaxtyping import Int
 
-from trifix.bundle import Adjusted, Constraints, NotAdjusted, adjust_steps
 from trifix.config import Config
 from trifix.doors import checked_map, in_order, with_usable_dots, with_usable_images, with_usable_points
 from trifix.errors import MapError
-from trifix.files.recordings import Recording, read_recording
+from trifix.files.recordings import Recording
 from trifix.geometry.alignment import spread_off_line_mm
 from trifix.geometry.camera import StereoRig
 from trifix.geometry.pose import Pose
@@ -482,49 +479,6 @@ class Positioner:
         while number in self._joined:
             number = self._joined[number]
         return step if number == self._world.number else None
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Positions:
-    """A whole recording, positioned."""
-
-    frame: Int[np.ndarray, "n"]
-    """Numbers of the frames."""
-    timestamp_ns: Int[np.ndarray, "n"]
-    """Their times (ns)."""
-    fixes: tuple[Fix | NoFix, ...]
-    """The answer for each of them."""
-    map: ReferenceMap
-    """The targets, as known in the end."""
-    noise_scale: float
-    """Factor on all standard deviations that the recording turned out to need."""
-    adjusted: Adjusted | NotAdjusted
-    """What adjusting everything together did, or why nothing was adjusted."""
-
-
-def position(
-    recording: Recording | Path | str,
-    config: Config | None = None,
-    map: ReferenceMap | None = None,
-    is_map_frozen: bool = False,
-) -> Positions:
-    """Every frame of a recording positioned by all that the whole recording tells, adjusted together, in one call.
-
-    Raises:
-        TrifixError: the recording cannot be read.
-    """
-    positioner = Positioner(config, map, is_map_frozen)
-    if not isinstance(recording, Recording):
-        recording = read_recording(Path(recording), sigma_px=positioner.config.noise.sigma_px)
-    steps = [step.remembered() for step in positioner.run(recording)]
-    revised = [replace(step, identification=None) for step in positioner.revise(steps)]
-    final, adjusted = adjust_steps(
-        revised, positioner.config, Constraints(map), is_noise_stated=recording.is_noise_stated
-    )
-    fixes = tuple(step.fix for step in final)
-    targets = final[-1].map.copy() if final else positioner.map.copy()
-    scale = final[-1].noise_scale if final else positioner.noise.scale
-    return Positions(recording.index, recording.timestamp_ns, fixes, targets, scale, adjusted)
 
 
 def _labelled_dots(image: GreyOrColour, options: DetectOptions) -> Dots:
