@@ -89,7 +89,8 @@ def run_recording(
                 for frame, step in progress.track(again, len(recording), description="reporting"):
                     report.show(replace(step, frame=replace(frame, rig=step.frame.rig)))  # with its images
                     stop_if_told()
-        summary = results.finish(adjusted)
+        told_map = None if isinstance(adjusted, Adjusted) else positioner.told_map()
+        summary = results.finish(adjusted, told_map)
     rig = final[0].frame.rig if final else None
     if rig is not None and isinstance(adjusted, Adjusted) and adjusted.rig_change:
         write_rig(rig, out / "calibration.yaml")
@@ -179,7 +180,7 @@ def run_live(
             console.line()
         if is_stopped() and isinstance(source, Replay):
             raise KeyboardInterrupt  # the recording goes on; cameras end when they are told to
-        summaries = {body: each.finish() for body, each in results.items()}
+        summaries = {body: each.finish(told_map=bodies[body].told_map()) for body, each in results.items()}
     pages = {body: folder / "report.html" for body, folder in folders.items()}
     for body, summary in summaries.items():
         reports[body].write(pages[body], summary)
