@@ -72,7 +72,7 @@ def run_recording(
                 else:
                     judged.append(step.remembered())
             if not is_online:
-                results.start_over()
+                results.start_over(positioner.told_map())
                 revised = list[Step]()
                 for step in progress.track(positioner.revise(judged), len(recording), description="revising"):
                     results.write(step)
@@ -80,7 +80,8 @@ def run_recording(
                     stop_if_told()
                 final = revised
                 if options.adjust.adjusts:
-                    results.start_over()  # what has been found stands, whatever becomes of the adjustment
+                    # what has been found stands, whatever becomes of the adjustment
+                    results.start_over(positioner.told_map())
                     known = options, constraints, recording.is_noise_stated
                     final, adjusted, fault = _adjusted(revised, *known, progress, stop_if_told)
                     for step in final:

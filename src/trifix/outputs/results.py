@@ -156,15 +156,16 @@ class ResultsWriter:
                 self._island_maps[step.elsewhere.island] = step.elsewhere.map
             self._tally.add(step, residual_px, dropped)
 
-    def start_over(self) -> None:
+    def start_over(self, told_map: ReferenceMap | None = None) -> None:
         """Begin again with the first frame; what has been written stands until the new is whole and takes its place.
 
-        That is when ``finish`` is called, or this once more.
+        That is when ``finish`` is called, or this once more. ``told_map`` is as there.
 
         Raises:
             RecordingError: the files cannot be written.
         """
         self._complain()
+        self._tell(told_map)
         try:
             with self._files:
                 self._flush()
@@ -193,14 +194,17 @@ class ResultsWriter:
         Raises:
             RecordingError: something could not be written.
         """
-        if told_map is not None:
-            with self._lock:
-                self._map = told_map
+        self._tell(told_map)
         self._rig_check.finish()
         self._is_finished, self._adjusted = True, adjusted
         self._close()
         self._complain()
         return self._summary
+
+    def _tell(self, told_map: ReferenceMap | None) -> None:
+        if told_map is not None:
+            with self._lock:
+                self._map = told_map
 
     def _close(self) -> None:
         self._closing.set()
