@@ -27,6 +27,7 @@ from trifix.records import (
     TargetState,
 )
 from trifix.sources.simulation import Simulation, simulate_frames
+from trifix.stages.triangulate import triangulate
 
 FRAMES = 70
 
@@ -452,3 +453,47 @@ def test_dots_that_no_frame_identified_are_found_by_the_adjusted_map(dots: Run) 
         )
         for camera, dot, target in zip(fix.single.camera, fix.single.dot, fix.single.target, strict=True):
             assert said.get((int(camera), int(dot)), target) == target
+
+
+def test_dots_are_found_alike_however_the_control_targets_turn_the_world(dots: Run) -> None:
+    map = dots.before[-1].map
+    own = map.rows(np.flatnonzero(map.state == TargetState.trusted)[::2])
+    own = replace(own, cov_mm2=np.tile(np.eye(3) * 0.05**2, (len(own), 1, 1)))
+    steps = [
+        replace(step, fix=replace(step.fix, single=SingleDots.none())) if isinstance(step.fix, Fix) else step
+        for step in dots.before
+    ]
+    found = []
+    for turn in (np.zeros(3), np.array([0.0, np.pi, 0.0]), np.array([np.pi / 2, 0.0, 0.0])):
+        T = Pose.exp(np.concatenate([[10.0, 20.0, 30.0], turn]))
+        _, told = adjust_steps(steps, constraints=Constraints(control=replace(own, xyz_mm=T.apply(own.xyz_mm))))
+        assert isinstance(told, Adjusted)
+        found.append(told.dots_found)
+    assert found[0] > 0
+    assert found[1:] == [found[0]] * 2
+
+
+def test_of_a_large_map_only_what_was_seen_is_adjusted_and_nothing_grows_with_its_square(dots: Run) -> None:
+    map = dots.before[-1].map
+    rows = np.concatenate([np.arange(len(map)), np.zeros(bundle.MOST_TARGETS, dtype=np.int64)])
+    large = map.rows(rows)
+    large.id[len(map) :] = 10_000 + np.arange(bundle.MOST_TARGETS)
+    large.state[len(map) :] = TargetState.removed
+    steps, told = adjust_steps([replace(step, map=large) for step in dots.before])
+    assert isinstance(told, Adjusted)
+    assert steps[-1].map.joint_mm2 is None
+    np.testing.assert_array_equal(steps[-1].map.xyz_mm[: len(map)], dots.after[-1].map.xyz_mm)
+
+
+def test_points_are_those_of_the_dots_where_they_were_moved(dots: Run) -> None:
+    moved = 0
+    for old, new in zip(dots.before, dots.after, strict=True):
+        if not isinstance(new.fix, Fix) or new.centres is None or new.matches is None or new.points is None:
+            continue
+        assert new.frame.rig is not None
+        anew = triangulate(new.centres, new.matches, new.frame.rig)
+        assert np.array_equal(anew.match, new.points.match)
+        np.testing.assert_allclose(new.points.xyz_mm, anew.xyz_mm, atol=1e-6)
+        assert old.points is not None
+        moved += not np.array_equal(new.points.xyz_mm, old.points.xyz_mm)
+    assert moved > 10

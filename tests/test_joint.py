@@ -216,6 +216,20 @@ def test_a_pose_that_single_dots_carry_owes_the_map_what_its_targets_share():
     assert np.linalg.eigvalsh(cov - own)[0] > -1e-12
 
 
+def test_to_tell_a_pose_holds_no_more_targets_than_before():
+    walk = Walk(strip(np.random.default_rng(1), 60), np.random.default_rng(2), 30)
+    for x_mm in np.linspace(0, 1000, 12):
+        walk.see(*along(walk.world, float(x_mm)))
+    unknowns, before = walk.joint.unknowns, walk.joint.covariance(np.arange(len(walk.map)))
+    for targets, points in walk.seen:
+        rows = walk.row_of[targets]
+        T = align_weighted(points.xyz_mm, walk.map.xyz_mm[rows], points.cov_mm2, np.zeros_like(points.cov_mm2))[0]
+        fix = Fix(T, np.eye(6), np.arange(len(rows)), rows, np.zeros(len(rows)), 1e-20)
+        walk.joint.settle(walk.map, points, fix)
+    assert walk.joint.unknowns == unknowns
+    np.testing.assert_array_equal(walk.joint.covariance(np.arange(len(walk.map))), before)
+
+
 def test_the_told_map_has_the_errors_that_all_targets_share():
     walk = Walk(strip(np.random.default_rng(1), 60), np.random.default_rng(2), 30)
     for x_mm in np.linspace(0, 900, 12):

@@ -330,6 +330,17 @@ def test_dots_that_are_not_finite_are_refused(world: np.ndarray) -> None:
     )
 
 
+@pytest.mark.parametrize("factor", [0.0, -1.0])
+def test_dots_without_a_covariance_are_refused(world: np.ndarray, factor: float) -> None:
+    dots = seen_dots(world + [50.0, 0.0, 470.0], np.random.default_rng(0), 0.1, PARALLEL)
+    cov = dots.left.cov_px2.copy()
+    cov[[2, 5]] *= factor
+    step = Positioner(rig=PARALLEL, is_noise_stated=True).push(replace(dots.left, cov_px2=cov), dots.right, 0)
+    assert isinstance(step.fix, NoFix)
+    assert step.fix.why is Reason.bad_points
+    assert "2 of 20 left dots have a covariance that is singular or negative, the first is dot 2." in step.fix.detail
+
+
 def test_dots_found_ahead_are_the_dots_of_the_step() -> None:
     rng = np.random.default_rng(0)
     image = rng.integers(100, 110, (1024, 1280)).astype(np.uint8)

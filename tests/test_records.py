@@ -1,5 +1,7 @@
 """A fix keeps what it says when its map is cut down or moves on."""
 
+from dataclasses import replace
+
 import numpy as np
 
 from constellations import RIG, front_map, looking, points_of, scattered, seen_dots
@@ -51,3 +53,12 @@ def test_a_fix_follows_its_targets_and_leaves_out_those_that_are_gone() -> None:
     assert there.single.residual_px[0] < 1e-6
     assert 1.5 < there.single.residual_px[1] < 4.5  # a millimetre across, seen from less than half a metre
     assert len(own.moved_to(targets, later, points, None, None).single) == 0
+
+
+def test_a_copy_of_a_map_shares_the_joint_covariance_that_never_changes() -> None:
+    map = front_map(scattered(np.random.default_rng(4), 6), 0.1)
+    joint = np.eye(18)
+    own = replace(map, joint_mm2=joint).copy()
+    assert own.joint_mm2 is joint
+    own.xyz_mm[0] += 1.0
+    assert not np.array_equal(own.xyz_mm, map.xyz_mm)

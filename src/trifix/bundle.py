@@ -214,6 +214,7 @@ class _Bundle:
         self._rigs = [step.frame.rig for step in self._placed if step.frame.rig is not None]
         self._scale = self._placed[-1].noise_scale
         self._growth = 0.0
+        self._is_settled = False  # whether dots were moved to where all frames together have their centres
         self._row_of = {int(i): row for row, i in enumerate(self._map.id.tolist()) if self._map.alive[row]}
         self._known = constraints.given if control is None else control
         named = [] if self._known is None else [i for i in self._known.id.tolist() if i in self._row_of]
@@ -230,6 +231,7 @@ class _Bundle:
         self._T = [self._T_world_map @ fix.T_world_sensor for fix in self._fixes]
         self._xyz = self._T_world_map.apply(self._map.xyz_mm)
         self._cov = self._T_world_map.R @ self._map.cov_mm2 @ self._T_world_map.R.T
+        self._view = self._map.view @ self._T_world_map.R.T
         self._started = self._T, self._xyz
         self._seen = self._with_a_say(self._collected())
         self._identified = len(self._seen)
@@ -433,6 +435,7 @@ class _Bundle:
             if k == _ROUNDS - 1:
                 break
             is_settled = k == 0 and self._has_dots and self._settle_centres()
+            self._is_settled |= is_settled
             more = self._found() if k == 0 and self._has_dots else _Sightings.joined([])
             is_news = self._learn_noise(is_noise_stated)
             if not is_news and not is_settled and not len(more):
@@ -506,7 +509,7 @@ class _Bundle:
                 continue
             own = self._seen.of(by_frame[start[k] : start[k + 1]])
             in_left = T.inverse().apply(self._xyz)
-            is_facing = alive & ~(((T.t_mm - self._xyz) * self._map.view).sum(axis=1) < 0)
+            is_facing = alive & ~(((T.t_mm - self._xyz) * self._view).sum(axis=1) < 0)
             in_right, centres = rig.T_right_left.apply(in_left), step.centres
             images = (rig.left, in_left, centres.left), (rig.right, in_right, centres.right)
             for camera, (lens, place, dots) in enumerate(images):
@@ -537,8 +540,7 @@ class _Bundle:
         is_in = self._out.is_target_adjusted
         cov[self._rows[is_in]] = self._out.target_cov_mm2[is_in]
         self._place_the_others(xyz, cov)
-        view, joint = self._map.view @ self._T_world_map.R.T, self._joint(cov)
-        map = replace(self._map, xyz_mm=xyz, cov_mm2=cov, view=view, joint_mm2=joint)
+        map = replace(self._map, xyz_mm=xyz, cov_mm2=cov, view=self._view, joint_mm2=self._joint(cov))
         scale = self._typical_scale()
         left_out = self._placed_anew()
         new = self._seen.of(np.arange(len(self._seen)) >= self._identified)
@@ -560,9 +562,14 @@ class _Bundle:
                 done.append(replace(step, frame=frame, fix=moved, map=map, noise_scale=scale))
         return done
 
-    def _joint(self, cov_mm2: Float[np.ndarray, "k 3 3"]) -> Float[np.ndarray, "k3 k3"]:
-        """Covariance of all targets together; those that were not adjusted are known each for itself."""
+    def _joint(self, cov_mm2: Float[np.ndarray, "k 3 3"]) -> Float[np.ndarray, "k3 k3"] | None:
+        """Covariance of all targets together; those that were not adjusted are known each for itself.
+
+        None where a map has too many: of a large one that was given, few may have been seen.
+        """
         k, rows = len(cov_mm2), self._rows[self._out.is_target_adjusted]
+        if k > MOST_TARGETS:
+            return None
         joint = np.zeros((3 * k, 3 * k))
         joint.reshape(k, 3, k, 3)[np.arange(k), :, np.arange(k)] = cov_mm2
         to = (3 * rows[:, None] + np.arange(3)).ravel()
@@ -600,8 +607,10 @@ class _Bundle:
         return replace(step, frame=frame, points=points, fix=fix, map=map)
 
     def _points(self, step: Step) -> SensorPoints | None:
-        """The points of a step, triangulated anew where the rig was refined."""
-        rig, points = self._out.rig, step.points
+        """The points of a step, triangulated anew where the rig was refined or the dots were moved."""
+        rig, points = self._out.rig or step.frame.rig, step.points
+        if self._out.rig is None and not self._is_settled:
+            return points
         if rig is None or points is None or step.centres is None or step.matches is None:
             return points
         anew = triangulate(step.centres, step.matches, rig, self._scale, self._config.triangulate)
@@ -755,15 +764,18 @@ def _off(
 
 def _by_camera(
     seen: _Sightings, T: Sequence[Pose], xyz_mm: Float[np.ndarray, "k 3"], rigs: Sequence[StereoRig]
-) -> Iterator[tuple[Camera, Bool[np.ndarray, "m"], Float[np.ndarray, "g 3"]]]:
+) -> Iterator[tuple[Camera, Int[np.ndarray, "g"], Float[np.ndarray, "g 3"]]]:
     """Every camera, which sightings are its own, and where their targets are in its coordinates."""
     in_sensor = _in_sensor(seen, T, xyz_mm)
     number = {id(rig): k for k, rig in enumerate(rigs)}
-    rig_of = np.array([number[id(rig)] for rig in rigs])[seen.frame]
-    for k in sorted(number.values()):
-        for camera, lens in enumerate((rigs[k].left, rigs[k].right)):
-            rows = (rig_of == k) & (seen.camera == camera)
-            yield lens, rows, rigs[k].T_right_left.apply(in_sensor[rows]) if camera else in_sensor[rows]
+    key = 2 * np.array([number[id(rig)] for rig in rigs], dtype=np.int64)[seen.frame] + seen.camera
+    order = np.argsort(key, kind="stable")
+    for rows in np.split(order, np.flatnonzero(np.diff(key[order])) + 1) if len(key) else ():
+        k, camera = divmod(int(key[rows[0]]), 2)
+        rig = rigs[k]
+        yield (
+            (rig.right, rows, rig.T_right_left.apply(in_sensor[rows])) if camera else (rig.left, rows, in_sensor[rows])
+        )
 
 
 def _in_sensor(seen: _Sightings, T: Sequence[Pose], xyz_mm: Float[np.ndarray, "k 3"]) -> Float[np.ndarray, "m 3"]:

@@ -14,6 +14,7 @@ from trifix.geometry.camera import Camera
 from trifix.records import Frame, GreyOrColour, Reason, ReferenceMap, SensorPoints, StereoDots, StereoImages, Unusable
 
 _FARTHEST_MM = 1e6  # no point lies, and no error reaches, a kilometre off
+_LEAST_VARIANCE_PX2 = 1e-12  # a millionth of a pixel: no dot is known better
 _LEAST_VARIANCE_MM2 = 1e-12  # a nanometre: nothing is known better
 _LEAST_VARIANCE_SHARE = 1e-12  # of the largest along another axis
 
@@ -50,7 +51,7 @@ def image_fault(image: GreyOrColour, camera: Camera) -> str:
 
 
 def with_usable_dots(frame: Frame, dots: StereoDots) -> Frame:
-    """The same frame, refused where a dot is not a number, or nobody knows the rig."""
+    """The same frame, refused where a dot is not a number or has no covariance, or nobody knows the rig."""
     if frame.rig is None:
         return _without_rig(frame, "dots")
     for side, each in (("left", dots.left), ("right", dots.right)):
@@ -58,6 +59,13 @@ def with_usable_dots(frame: Frame, dots: StereoDots) -> Frame:
         if not finite.all():
             detail = (
                 f"{(~finite).sum()} of {len(each)} {side} dots are not finite, the first is dot {np.argmin(finite)}."
+            )
+            return replace(frame, content=Unusable(Reason.bad_points, detail))
+        is_none = np.linalg.eigvalsh(each.cov_px2)[:, 0] < _LEAST_VARIANCE_PX2
+        if is_none.any():
+            detail = (
+                f"{is_none.sum()} of {len(each)} {side} dots have a covariance that is singular or negative, the first "
+                f"is dot {np.argmax(is_none)}."
             )
             return replace(frame, content=Unusable(Reason.bad_points, detail))
     return frame

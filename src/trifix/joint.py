@@ -70,8 +70,10 @@ class JointMap:
         trusted = np.flatnonzero(map.state[seen.target] == _TRUSTED)
         if len(trusted) >= _HOLDING:
             seen = seen.rows(trusted)
-        self._recall(seen.target)
-        delta, cov, _, _ = self._condition(map, fix.T_world_sensor, seen, 0)
+        P, blocks = self._P, self._block[seen.target]
+        if (blocks < 0).any():  # as if they were held, but nobody makes room for them
+            P, blocks = self.covariance(seen.target), np.arange(len(seen))
+        delta, cov, _, _ = self._condition(map, fix.T_world_sensor, seen, P, blocks, 0)
         return fix.T_world_sensor @ Pose.exp(delta), cov
 
     def learn(self, map: ReferenceMap, points: SensorPoints, fix: Fix) -> "Knowledge":
@@ -84,7 +86,8 @@ class JointMap:
         self._seen[seen.target] = self._frames
         self._make_room(seen.target)
         self._recall(seen.target)
-        delta, cov, cross, shift = self._condition(map, fix.T_world_sensor, seen, self._used)
+        blocks = self._block[seen.target]
+        delta, cov, cross, shift = self._condition(map, fix.T_world_sensor, seen, self._P, blocks, self._used)
         self._move(map, shift)
         return Knowledge(
             fix.T_world_sensor @ Pose.exp(delta), cov, np.pad(cross, ((0, 0), (0, len(self._P) - self._used)))
@@ -183,14 +186,19 @@ class JointMap:
             known = known[np.lexsort((sigma2, is_away))[: self._capacity]]
         return seen if len(known) == len(seen) else seen.rows(known)
 
+    @staticmethod
     def _condition(
-        self, map: ReferenceMap, T: Pose, seen: "_Seen", used: int
+        map: ReferenceMap,
+        T: Pose,
+        seen: "_Seen",
+        P: Float[np.ndarray, "cap cap"],
+        blocks: Int[np.ndarray, "c"],
+        used: int,
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
         places, R, t = floats(map.xyz_mm[seen.target]), floats(T.R), floats(T.t_mm)
         r, noise = kernels.residuals(places, floats(seen.xyz_mm), floats(seen.cov_mm2), R, t)
         H = kernels.pose_fields(places, R, t)
-        blocks = integers(self._block[seen.target])
-        delta, cov, cross, shift = kernels.condition(self._P, used, blocks, noise, H, r, -1.0)
+        delta, cov, cross, shift = kernels.condition(P, used, integers(blocks), noise, H, r, -1.0)
         return delta, cov, cross, shift
 
     def _shared(self, map: ReferenceMap, T: Pose, rows: Int[np.ndarray, "r"]) -> Float[np.ndarray, "6 6"]:

@@ -250,8 +250,9 @@ class ReferenceMap:
         )
 
     def copy(self) -> "ReferenceMap":
-        """The same map with storage of its own."""
-        return self.rows(np.arange(len(self)))
+        """The same map with storage of its own, but for the joint covariance, which never changes in place."""
+        own = replace(self, joint_mm2=None).rows(np.arange(len(self)))
+        return replace(own, joint_mm2=self.joint_mm2)
 
     @staticmethod
     def empty() -> "ReferenceMap":

@@ -1,5 +1,6 @@
 """Cameras that deliver, fail and come back, without any camera: scripted ones, and videos read as if they were live."""
 
+import threading
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -138,6 +139,37 @@ def test_a_closed_source_ends_with_the_frame_that_is_being_taken() -> None:
             source.close()
     assert len(taken) == 3
     assert left.is_closed
+
+
+def test_cameras_are_given_free_where_nobody_takes_any_more_frames() -> None:
+    left, right = Script([shot(k) for k in range(9)]), Script([shot(k, noisy(100 + k)) for k in range(9)])
+    for _ in CameraFrames(TwoCameras(left, right), PARALLEL):
+        break
+    assert left.is_closed
+    assert right.is_closed
+
+
+def test_cameras_with_a_clock_of_their_own_may_begin_with_a_fault() -> None:
+    left = ["camera 0 waits for its trigger.", *(shot(k) for k in range(3))]
+    found = frames(left, [shot(k, noisy(100 + k)) for k in (0, 0, 1, 2)])
+    stamps = np.array([frame.timestamp_ns for frame in found])
+    assert [bool(said(frame)) for frame in found] == [True, False, False, False]
+    assert (np.diff(stamps) >= 0).all()
+    assert np.diff(stamps)[1:].tolist() == [STEP_NS, STEP_NS]
+
+
+def test_a_camera_that_hangs_does_not_keep_the_program_from_ending() -> None:
+    class Hanging(Script):
+        def read(self) -> Shot | str | None:
+            threading.Event().wait()
+            return None
+
+    pairs = TwoCameras(Hanging([]), Hanging([]))
+    threading.Thread(target=pairs.read, daemon=True).start()
+    capturing = [thread for thread in threading.enumerate() if thread.name == "capture"]
+    assert len(capturing) >= 2
+    assert all(thread.daemon for thread in capturing)
+    pairs.close()
 
 
 # --- OpenCV ----------------------------------------------------------------------------------------------------------

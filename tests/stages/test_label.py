@@ -114,6 +114,17 @@ def test_hues_say_nothing_of_grey_images_and_leave_codes_alone():
     np.testing.assert_array_equal(add_hues(dots, image, hues).label, [0])
 
 
+def test_black_dots_and_those_without_a_core_have_no_hue():
+    image = np.full((60, 60, 3), 200, np.uint8)
+    cv2.circle(image, (30, 30), 10, (0, 0, 0), -1)
+    dots = Dots.of(np.array([[30.0, 30.0]]), diameter_px=np.array([10.0]))
+    hues = np.array([0.0, 120.0])
+    np.testing.assert_array_equal(add_hues(dots, image, hues).label, [-1])
+    narrow = Dots(np.array([[20.5, 20.5]]), dots.cov_px2, np.array([[1.8, 0.6, 0.0]]), dots.label, dots.row)
+    image[15:25, 15:25] = (40, 40, 200)
+    np.testing.assert_array_equal(add_hues(narrow, image, hues).label, [-1])
+
+
 @pytest.mark.parametrize("hues", ["red", "0 360", "nan"])
 def test_impossible_hues_are_refused(hues: str):
     with pytest.raises(ConfigError, match="different angles in degrees"):

@@ -7,10 +7,12 @@ again. Knows no dot and no pose.
 
 import time
 from collections.abc import Iterator
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Future, wait
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
+from queue import SimpleQueue
+from threading import Thread
 from typing import Protocol, runtime_checkable
 
 import cv2
@@ -169,11 +171,13 @@ class TwoCameras:
     def __init__(self, left: Camera, right: Camera, max_skew_ms: float = 10.0) -> None:
         self.dropped = 0
         self._left, self._right, self._max_skew_ms = left, right, max_skew_ms
-        self._threads = ThreadPoolExecutor(2, thread_name_prefix="capture")
+        self._readers = _Reader(left), _Reader(right)
 
     def read(self) -> tuple[Shot, Shot] | str | None:
         """The next left and right image, as ``Camera.read``."""
-        left, right = self._threads.map(lambda camera: camera.read(), (self._left, self._right))
+        coming = [each.read() for each in self._readers]
+        wait(coming)
+        left, right = (each.result() for each in coming)
         for _ in range(_CATCH_UP):
             if not (isinstance(left, Shot) and isinstance(right, Shot)) or self._are_one_exposure(left, right):
                 break
@@ -197,12 +201,39 @@ class TwoCameras:
 
     def close(self) -> None:
         """Give the cameras free."""
-        self._threads.shutdown(wait=False)
+        for each in self._readers:
+            each.close()
         self._left.close()
         self._right.close()
 
     def _are_one_exposure(self, left: Shot, right: Shot) -> bool:
         return abs(left.timestamp_ns - right.timestamp_ns) <= 1e6 * self._max_skew_ms
+
+
+class _Reader:
+    """A thread that reads one camera when asked to, and does not keep the program from ending if that hangs."""
+
+    def __init__(self, camera: Camera) -> None:
+        self._camera = camera
+        self._asked: SimpleQueue[Future[Shot | str | None] | None] = SimpleQueue()
+        Thread(target=self._work, name="capture", daemon=True).start()
+
+    def read(self) -> "Future[Shot | str | None]":
+        """What the camera will deliver next."""
+        coming: Future[Shot | str | None] = Future()
+        self._asked.put(coming)
+        return coming
+
+    def close(self) -> None:
+        """No more reading."""
+        self._asked.put(None)
+
+    def _work(self) -> None:
+        while (coming := self._asked.get()) is not None:
+            try:
+                coming.set_result(self._camera.read())
+            except BaseException as error:  # whoever asked is told
+                coming.set_exception(error)
 
 
 class SideBySide:
@@ -242,22 +273,28 @@ class CameraFrames:
     def __iter__(self) -> Iterator[Frame]:
         index, eyes = 0, (_Eye("left"), _Eye("right"))
         newest_ns, came_ns = _EPOCH_NS + time.monotonic_ns(), time.monotonic_ns()
-        while not self._is_closed and (got := self._pairs.read()) is not None:
-            content: StereoImages | Unusable
-            if isinstance(got, str):
-                now_ns = time.monotonic_ns()  # by the camera's clock, whatever that is
-                stamp_ns, content = newest_ns + now_ns - came_ns, Unusable(Reason.unreadable_image, got)
-            else:
-                left, right = got
-                stamp_ns = newest_ns = left.timestamp_ns
-                came_ns = time.monotonic_ns()
-                faults = [eye.fault(shot.image) for eye, shot in zip(eyes, got, strict=True)]
-                content = StereoImages(left.image, right.image)
-                if any(faults):
-                    content = Unusable(Reason.unreadable_image, " ".join(filter(None, faults)))
-            yield Frame(index, stamp_ns, self._rig, content)
-            index += 1
-        self._pairs.close()
+        stamp_ns = -(1 << 63)
+        ahead_ns: int | None = None
+        try:
+            while not self._is_closed and (got := self._pairs.read()) is not None:
+                content: StereoImages | Unusable
+                if isinstance(got, str):
+                    now_ns = time.monotonic_ns()  # by the camera's clock, whatever that is
+                    stamp_ns, content = newest_ns + now_ns - came_ns, Unusable(Reason.unreadable_image, got)
+                else:
+                    left, right = got
+                    if ahead_ns is None:  # faults before the first image have been told by another clock, perhaps
+                        ahead_ns = max(stamp_ns - left.timestamp_ns, 0)
+                    stamp_ns = newest_ns = left.timestamp_ns + ahead_ns
+                    came_ns = time.monotonic_ns()
+                    faults = [eye.fault(shot.image) for eye, shot in zip(eyes, got, strict=True)]
+                    content = StereoImages(left.image, right.image)
+                    if any(faults):
+                        content = Unusable(Reason.unreadable_image, " ".join(filter(None, faults)))
+                yield Frame(index, stamp_ns, self._rig, content)
+                index += 1
+        finally:  # also where nobody takes any more frames
+            self._pairs.close()
 
     def close(self) -> None:
         """No more frames than the one that is being taken."""

@@ -54,7 +54,7 @@ def add_hues(dots: Dots, image: GreyOrColour, hues_deg: Float[np.ndarray, "h"]) 
     for k in np.flatnonzero((label < 0) & np.isfinite(dots.ellipse).all(axis=1)):
         blue, green, red = _colour(image, dots.uv_px[k], dots.ellipse[k])
         most, least = max(blue, green, red), min(blue, green, red)
-        if most - least < _LEAST_SATURATION * most:
+        if not most - least > _LEAST_SATURATION * most:  # black has no hue, nor what has no core
             continue
         hue_deg = np.degrees(np.arctan2(np.sqrt(3) * (green - blue), 2 * red - green - blue))
         off_deg = np.abs((hues_deg - hue_deg + 180) % 360 - 180)
@@ -108,4 +108,4 @@ def _colour(
     x, y = u - uv_px[0], v - uv_px[1]
     along, across = np.cos(theta) * x + np.sin(theta) * y, np.cos(theta) * y - np.sin(theta) * x
     core = (along / a) ** 2 + (across / b) ** 2 <= _CORE**2
-    return np.asarray(image[v0:v1, u0:u1][core].mean(axis=0))
+    return np.asarray(image[v0:v1, u0:u1][core].mean(axis=0)) if core.any() else np.zeros(3)
