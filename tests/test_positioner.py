@@ -393,7 +393,7 @@ def test_two_runs_are_the_same_to_the_last_bit(level, frames):
         assert a.cov.tobytes() == b.cov.tobytes()
         np.testing.assert_array_equal(a.point, b.point)
         np.testing.assert_array_equal(a.target, b.target)
-        for name in ReferenceMap.__slots__:
+        for name in set(ReferenceMap.__slots__) - {"joint_mm2"}:  # that only an adjusted map has
             assert getattr(one.map, name).tobytes() == getattr(other.map, name).tobytes()
 
 
