@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from board_views import RIG, poses
+from trifix import boards
 from trifix.boards import Board, find_views
 from trifix.calibration import BoardView, Sighting
 from trifix.errors import CalibrationError, ConfigError
@@ -151,3 +152,9 @@ def test_images_of_two_sizes_are_refused() -> None:
 def test_impossible_boards_are_refused(arguments: tuple[object, ...], text: str) -> None:
     with pytest.raises(ConfigError, match=text):
         Board(*arguments)  # type: ignore[arg-type]
+
+
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize("board", [Board("dots", 10.0, 7, 5), Board("dots", 10.0, has_rings=True)])
+def test_an_image_without_dots_shows_no_grid(board: Board) -> None:
+    assert not boards._find(np.full((80, 90), 200, np.uint8), board).ways

@@ -330,6 +330,8 @@ def _lattice(uv_px: Float[np.ndarray, "n 2"]) -> tuple[Int[np.ndarray, "m"], Int
     Cells count up along two short steps, the second to the right of the first as the image shows them.
     """
     best: dict[int, tuple[int, int]] = {}
+    if not len(uv_px):
+        return np.zeros(0, dtype=np.int64), np.zeros((0, 2), dtype=np.int64)
     for seed in np.argsort(np.linalg.norm(uv_px - np.median(uv_px, axis=0), axis=1))[:_SEEDS].tolist():
         grown = _grow(uv_px, seed)
         best = grown if len(grown) > len(best) else best
