@@ -314,6 +314,8 @@ def _are_rings(grey: UInt8[np.ndarray, "h w"], dots: Dots) -> Bool[np.ndarray, "
 
 def _along_ellipses(grey: UInt8[np.ndarray, "h w"], dots: Dots, scale: float) -> Float[np.ndarray, "n"]:
     """Mean grey value on each dot's ellipse, shrunk or widened."""
+    if not len(dots):
+        return np.zeros(0)
     phi = np.linspace(0, 2 * np.pi, 24, endpoint=False)
     a, b, theta = (dots.ellipse.T * [[scale], [scale], [1.0]])[:, :, None]
     u = dots.uv_px[:, :1] + a * np.cos(phi) * np.cos(theta) - b * np.sin(phi) * np.sin(theta)
