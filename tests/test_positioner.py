@@ -134,6 +134,20 @@ def test_fewer_than_three_points_are_too_few(world, count, level):
         refused(Positioner(map=map, is_noise_stated=True).step(frame_of(0, content)), Reason.too_few_points)
 
 
+def test_points_of_which_none_agrees_are_said_to_in_words(world):
+    rng = np.random.default_rng(1)
+    T = looking(rng)
+    dots = seen_dots(T.inverse().apply(world), rng)
+    positioner = Positioner(map=front_map(world), is_noise_stated=True)
+    fixed(positioner.step(frame_of(0, dots)).fix)
+    none, one = some_dots(dots.right, np.zeros(0, dtype=np.int64)), some_dots(dots.left, np.arange(1))
+    answer = refused(positioner.step(frame_of(1, StereoDots(one, none))), Reason.too_few_points)
+    assert (answer.matched, answer.detail) == (0, "No point.")
+    far = some_points(seen_points(world + [0.0, 0.0, 400.0], T, rng), np.arange(1))
+    answer = refused(positioner.step(frame_of(2, far)), Reason.too_few_points)
+    assert (answer.matched, answer.detail) == (0, "One point.")
+
+
 def test_dots_in_one_image_only_are_too_few_points(world):
     rng = np.random.default_rng(2)
     dots = seen_dots(looking(rng).inverse().apply(world), rng)

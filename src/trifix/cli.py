@@ -282,7 +282,8 @@ def compare(
         second: Another of the same recording.
         page: HTML file to write, with the figures side by side.
     """
-    from trifix.outputs.comparison import compare_runs, comparison_table, read_run, write_comparison
+    from trifix.outputs.comparison import compare_runs, comparison_table, write_comparison
+    from trifix.outputs.runs import read_run
 
     runs = read_run(first), read_run(second)
     found = compare_runs(*runs)

@@ -14,6 +14,7 @@ import numpy as np
 from jaxtyping import Int
 
 from trifix.config import Config
+from trifix.geometry.alignment import spread_off_line_mm
 from trifix.geometry.pose import Pose
 from trifix.index import MapIndex
 from trifix.joint import JointMap
@@ -35,12 +36,13 @@ from trifix.stages.identify import AS_PREDICTED, any_triangles, identifier, pair
 from trifix.stages.orient import orient
 from trifix.stages.predict import Motion, follow, predict
 from trifix.stages.tend import Care, Hand
-from trifix.stages.update import found_map, update
+from trifix.stages.update import distinct, found_map, update
 from trifix.stages.verify import Evidence, fewest_points, verify
 from trifix.stages.verify_residual import verify_residual
 
 _UNDECIDED = (Reason.no_candidate, Reason.not_proven, Reason.residual)
 NOTHING = np.zeros(0, dtype=np.int64)
+FEW_POINTS = ("No point.", "One point.", "Two points.")
 
 
 class Island:
@@ -289,3 +291,30 @@ class Stopwatch:
         start = perf_counter()
         yield
         self.ms[stage] = self.ms.get(stage, 0.0) + 1e3 * (perf_counter() - start)
+
+
+def define_world(points: SensorPoints) -> Fix | NoFix:
+    """The first frame is where the world begins, if its points could ever be recognised."""
+    if len(points) < 3:
+        return NoFix(Reason.too_few_points, FEW_POINTS[len(points)])
+    spread_mm = spread_off_line_mm(points.xyz_mm)
+    if spread_mm < 3.0:
+        return NoFix(Reason.weak_geometry, "The points lie within 3 mm of one line.")
+    sigma_mm = float(np.sqrt(np.median(np.trace(points.cov_mm2, axis1=1, axis2=2))))
+    if spread_mm < 3.0 * sigma_mm:
+        detail = f"The points lie within {spread_mm:.0f} mm of one line, and are known to {sigma_mm:.0f} mm only."
+        return NoFix(Reason.weak_geometry, detail)
+    rows = distinct(points, np.arange(len(points)))
+    if len(rows) < 3:
+        return NoFix(
+            Reason.weak_geometry, f"{len(rows)} of {len(points)} points are known to a tenth of their distance."
+        )
+    return Fix(
+        T_world_sensor=Pose.identity(),
+        cov=np.zeros((6, 6)),
+        point=rows,
+        target=np.arange(len(rows)),
+        residual_mm=np.zeros(len(rows)),
+        p_chance=float("nan"),
+        reason=PositionedReason.defines_world,
+    )

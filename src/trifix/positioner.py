@@ -16,10 +16,10 @@ from trifix.config import Config
 from trifix.doors import checked_map, in_order, with_usable_dots, with_usable_images, with_usable_points
 from trifix.errors import MapError
 from trifix.files.recordings import Recording
-from trifix.geometry.alignment import spread_off_line_mm
 from trifix.geometry.camera import StereoRig
 from trifix.geometry.pose import Pose
-from trifix.island import NOTHING, Island, Stopwatch
+from trifix.island import FEW_POINTS, NOTHING, Island, Stopwatch, define_world
+from trifix.noise import Noise
 from trifix.records import (
     Dots,
     Elsewhere,
@@ -44,17 +44,11 @@ from trifix.stages.detect import DetectOptions, detect
 from trifix.stages.identify import Identifier
 from trifix.stages.label import add_codes, add_hues
 from trifix.stages.match import match
+from trifix.stages.predict import across
 from trifix.stages.triangulate import correct_eccentricity, triangulate
-from trifix.stages.update import distinct, stored
+from trifix.stages.update import stored
 from trifix.stages.verify import Evidence
-from trifix.stages.weigh import (
-    NoiseScale,
-    add_prior_noise,
-    scale_points,
-    starting_scale,
-    weigh_matches,
-    weigh_residuals,
-)
+from trifix.stages.weigh import add_prior_noise, scale_points
 
 _HERE_PERHAPS = 1e-3  # no part of the object is new where what is known agrees so well
 _COULD_BE_ELSEWHERE = (Reason.no_candidate, Reason.not_proven, Reason.out_of_time)
@@ -87,10 +81,7 @@ class Positioner:
     ) -> None:
         self.config = config or Config()
         self.rig = rig
-        self.noise = self._epipolar = self._residuals = NoiseScale()
-        self._is_noise_stated = is_noise_stated
-        self._sought = 1.0
-        """Scale of the noise at which the newest frame's pairs were sought."""
+        self.noise = Noise(self.config.noise, self.config.match.max_epipolar_sigmas, is_noise_stated)
         if is_map_frozen and (map is None or not map.alive.any()):
             raise MapError("A frozen map without targets was given: nothing could ever be found on it.")
         self._world = Island(0, self.config, stored(checked_map(map or ReferenceMap.empty())), is_map_frozen)
@@ -120,7 +111,7 @@ class Positioner:
     def run(self, frames: Iterable[Frame]) -> Iterator[Step]:
         """A Step for every frame, in order, as soon as it is judged."""
         if isinstance(frames, Recording):
-            self._is_noise_stated = frames.is_noise_stated
+            self.noise.is_stated = frames.is_noise_stated
         for frame in frames:
             yield self.step(frame)
 
@@ -250,11 +241,9 @@ class Positioner:
             case StereoDots():
                 assert frame.rig is not None, "dots come with the rig that saw them"
                 with clock("match"):
-                    is_first_guess = self._is_noise_stated and not self.noise.is_known
-                    self._sought = starting_scale(content, options.noise) if is_first_guess else self.noise.scale
-                    matches = match(content, frame.rig, options.match, self._sought)
-                    if self._epipolar.seen < options.noise.min_samples:
-                        self._weigh_pairs(matches)
+                    matches = match(content, frame.rig, options.match, self.noise.sought(content))
+                    if not self.noise.is_settled:
+                        self._rescale(self.noise.weigh_pairs(matches))
                 with clock("triangulate"):
                     centres, scale = content, self.noise.scale
                     if options.triangulate.correct_eccentricity:
@@ -262,7 +251,7 @@ class Positioner:
                     points = triangulate(centres, matches, frame.rig, scale, options.triangulate)
                 return content, matches, centres, points
             case SensorPoints():
-                return None, None, None, scale_points(content, self.noise)
+                return None, None, None, scale_points(content, self.noise.found)
             case Unusable():
                 return None, None, None, None
             case _:
@@ -280,7 +269,7 @@ class Positioner:
         if len(points) > limit:
             return None, None, NoFix(Reason.out_of_time, f"{len(points)} points, and at most {limit} are searched.")
         if len(self.map) == 0:
-            fix = _define_world(points)
+            fix = define_world(points)
             return (self._world if isinstance(fix, Fix) else None), None, fix
         identification, fix = self._world.position(evidence, self._world.predicted(frame.timestamp_ns), clock)
         if isinstance(fix, Fix):
@@ -291,7 +280,7 @@ class Positioner:
                 if isinstance(elsewhere, Fix):
                     return island, there, elsewhere
         if len(points) < 3:
-            fix = replace(fix, why=Reason.too_few_points, detail=f"{len(points)} points. {fix.detail}".strip())
+            fix = replace(fix, why=Reason.too_few_points, detail=f"{FEW_POINTS[len(points)]} {fix.detail}".strip())
         return None, identification, fix
 
     def _learn(
@@ -304,7 +293,7 @@ class Positioner:
         clock: Stopwatch,
     ) -> np.ndarray:
         """A fix to a better map; returns the rows of the targets that are new."""
-        self._weigh(points, matches, island.map, fix)
+        self._rescale(self.noise.weigh(points, matches, island.map, fix))
         with clock("update"):
             added = island.learn(frame, points, matches, fix, self._next_id)
             self._next_id += len(added)
@@ -317,11 +306,11 @@ class Positioner:
 
         Before the noise is known, it is taken for larger than it mostly is, and so is the pose's sigma.
         """
-        if self._epipolar.seen < self.config.noise.min_samples:
-            self._learn(frame, points, matches, self._world, fix, clock)
-        else:
-            self._weigh(points, matches, self.map, fix)
+        if self.noise.is_settled:
+            self._rescale(self.noise.weigh(points, matches, self.map, fix))
             self._world.follow(frame.timestamp_ns, fix)
+        else:
+            self._learn(frame, points, matches, self._world, fix, clock)
 
     def _may_found(self, points: SensorPoints, fix: Fix | NoFix) -> bool:
         """Whether a frame could belong to a part of the object that no map knows yet."""
@@ -333,7 +322,7 @@ class Positioner:
             and options.max_islands > 0
             and not self._is_map_frozen
             and len(points) >= options.min_points
-            and isinstance(_define_world(points), Fix)
+            and isinstance(define_world(points), Fix)
         )
 
     def _found_island(self, frame: Frame, points: SensorPoints) -> tuple[Island, Fix | None]:
@@ -343,7 +332,7 @@ class Positioner:
         self._founded += 1
         link = self._world.predicted(frame.timestamp_ns)
         island = Island(self._founded, self.config, ReferenceMap.empty(), T_world_island=link)
-        first = _define_world(points)
+        first = define_world(points)
         assert isinstance(first, Fix), "asked before"
         self._next_id += len(island.learn(frame, points, None, first, self._next_id))
         self._islands.append(island)
@@ -384,37 +373,13 @@ class Positioner:
     def _expected(self, island: Island, other: Island, T_island_sensor: Pose) -> Prediction | None:
         """Where the sensor should be on another map, if one of the two is the world and the motion linked them."""
         if other is self._world and island.T_world_island is not None:
-            return _across(island.T_world_island, T_island_sensor, is_to_world=True)
+            return across(island.T_world_island, T_island_sensor, is_to_world=True)
         if island is self._world and other.T_world_island is not None:
-            return _across(other.T_world_island, T_island_sensor, is_to_world=False)
+            return across(other.T_world_island, T_island_sensor, is_to_world=False)
         return None
 
-    def _weigh(self, points: SensorPoints, matches: StereoMatches | None, map: ReferenceMap, fix: Fix) -> None:
-        """What identified points tell of the recording's noise: by their residuals, and their dots by epipolar ones."""
-        options, is_stated = self.config.noise, self._is_noise_stated
-        now = weigh_residuals(replace(self._residuals, scale=self.noise.scale), points, map, fix, is_stated, options)
-        self._residuals = _newest(self._residuals, now)
-        if matches is not None and self._epipolar.seen >= options.min_samples:
-            self._weigh_pairs(matches.rows(points.match[fix.point]))
-        elif matches is None:
-            self._take_noise(self._residuals)
-
-    def _weigh_pairs(self, matches: StereoMatches) -> None:
-        """Epipolar residuals to the recording's noise: those of identified points, or all before anything is known.
-
-        They see the dots' errors across the epipolar lines alone, and a calibration that was fitted to the same dots
-        hides some of them: where the residuals on targets are larger, these count.
-        """
-        gate, options = self.config.match.max_epipolar_sigmas, self.config.noise
-        now = weigh_matches(replace(self._epipolar, scale=self._sought), matches, gate, self._is_noise_stated, options)
-        self._epipolar = _newest(self._epipolar, now)
-        is_larger = self._residuals.is_known and self._residuals.scale > self._epipolar.scale
-        self._take_noise(self._residuals if is_larger else self._epipolar)
-
-    def _take_noise(self, noise: NoiseScale) -> None:
-        """A new noise scale; what the maps owe to the old one follows it."""
-        ratio = noise.scale / self.noise.scale
-        self.noise = noise
+    def _rescale(self, ratio: float) -> None:
+        """The noise scale has changed by a factor: what the maps owe to it follows."""
         if ratio != 1.0 and not self._is_map_given:
             for island in (self._world, *self._islands):
                 island.rescale(ratio)
@@ -487,47 +452,6 @@ def _labelled_dots(image: GreyOrColour, options: DetectOptions) -> Dots:
     if options.codes != "none":
         dots = add_codes(dots, image, options.codes)
     return add_hues(dots, image, options.hues_deg)
-
-
-def _define_world(points: SensorPoints) -> Fix | NoFix:
-    """The first frame is where the world begins, if its points could ever be recognised."""
-    if len(points) < 3:
-        return NoFix(Reason.too_few_points, f"{len(points)} points.")
-    spread_mm = spread_off_line_mm(points.xyz_mm)
-    if spread_mm < 3.0:
-        return NoFix(Reason.weak_geometry, "The points lie within 3 mm of one line.")
-    sigma_mm = float(np.sqrt(np.median(np.trace(points.cov_mm2, axis1=1, axis2=2))))
-    if spread_mm < 3.0 * sigma_mm:
-        detail = f"The points lie within {spread_mm:.0f} mm of one line, and are known to {sigma_mm:.0f} mm only."
-        return NoFix(Reason.weak_geometry, detail)
-    rows = distinct(points, np.arange(len(points)))
-    if len(rows) < 3:
-        return NoFix(
-            Reason.weak_geometry, f"{len(rows)} of {len(points)} points are known to a tenth of their distance."
-        )
-    return Fix(
-        T_world_sensor=Pose.identity(),
-        cov=np.zeros((6, 6)),
-        point=rows,
-        target=np.arange(len(rows)),
-        residual_mm=np.zeros(len(rows)),
-        p_chance=float("nan"),
-        reason=PositionedReason.defines_world,
-    )
-
-
-def _across(link: Prediction, T: Pose, is_to_world: bool) -> Prediction:
-    """Where a sensor is in the world whose pose on an island is known, or the other way round."""
-    T_world_island = link.T_world_sensor
-    there = T_world_island @ T if is_to_world else T_world_island.inverse() @ T
-    A = (T if is_to_world else there).inverse().adjoint()
-    return Prediction(there, A @ link.cov @ A.T)
-
-
-def _newest(before: NoiseScale, now: NoiseScale) -> NoiseScale:
-    """What is known now, with the scale last fitted, or the one to start from where a stated noise became doubtful."""
-    is_other = now.fitted_at != before.fitted_at or now.is_doubted != before.is_doubted
-    return now if is_other else replace(now, scale=before.scale)
 
 
 def _sum(first: dict[str, float], second: dict[str, float]) -> dict[str, float]:

@@ -9,8 +9,9 @@ from test_report import Page
 
 from trifix.errors import RecordingError
 from trifix.geometry.pose import Pose
-from trifix.outputs.comparison import Comparison, compare_runs, differences, read_run, write_comparison
+from trifix.outputs.comparison import Comparison, compare_runs, differences, write_comparison
 from trifix.outputs.results import ResultsWriter
+from trifix.outputs.runs import read_run
 from trifix.records import Fix, NoFix, PositionedReason, Reason, ReferenceMap, Step
 
 OPTIONS = "[match]\nmax_depth_mm = 900.0\n"

@@ -7,7 +7,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from jinja2 import Environment, PackageLoader, StrictUndefined
 from matplotlib.figure import Figure
 from rich.console import Group
 from rich.table import Table
@@ -25,6 +24,7 @@ from trifix.experiments.figures import (
 )
 from trifix.experiments.measuring import Part, growth, slope
 from trifix.files.tables import write_atomically, write_table
+from trifix.outputs.page import environment
 from trifix.outputs.summary import versions
 from trifix.sources.scenes import SCENES
 
@@ -118,7 +118,7 @@ def write_experiment(parts: Sequence[Part], out: Path, command: str) -> Path:
     _write_tables(parts, out / "tables")
     page = out / "experiment.html"
     text = (
-        _environment()
+        environment("trifix.experiments")
         .get_template("experiment.html.jinja")
         .render(
             scenes=_by_scene(parts),
@@ -238,23 +238,3 @@ def _row(part: Part) -> dict[str, str]:
 
 def _number(value: float | None) -> str:
     return "" if value is None else f"{value:.6g}"
-
-
-def _environment() -> Environment:
-    environment = Environment(
-        loader=PackageLoader("trifix.experiments", "."),
-        autoescape=True,
-        undefined=StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-    )
-    environment.filters["number"] = lambda value: (
-        "–" if value is None else _thousands(value) if value >= 1000 else f"{value:.3g}" if value > 1e-9 else "0"
-    )
-    environment.filters["thousands"] = _thousands
-    environment.filters["words"] = lambda name: name.replace("_", " ")
-    return environment
-
-
-def _thousands(count: float) -> str:
-    return f"{count:,.0f}".replace(",", "\u202f")

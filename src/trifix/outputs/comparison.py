@@ -1,7 +1,7 @@
 """Two runs of one recording side by side: which frames each positioned, how far their poses and maps are apart.
 
-Reads results folders and nothing else. Knows no truth, so it cannot say which of the two is right: that is asked of
-``trifix evaluate``.
+Looks at what their folders hold and nothing else. Knows no truth, so it cannot say which of the two is right: that is
+asked of ``trifix evaluate``.
 """
 
 from collections import Counter
@@ -9,7 +9,6 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
-import msgspec
 import numpy as np
 from jaxtyping import Float, Int
 from rich.console import Group, RenderableType
@@ -18,16 +17,13 @@ from rich.text import Text
 
 from trifix.errors import RecordingError
 from trifix.evaluation import Spread, compare_poses
-from trifix.files.maps import read_map
-from trifix.files.tables import read_table, write_atomically
-from trifix.files.trajectories import read_poses
+from trifix.files.tables import write_atomically
 from trifix.geometry.pose import Pose
-from trifix.outputs.course import Course
 from trifix.outputs.figures import difference_figure, path_figure, time_figure
 from trifix.outputs.page import environment
+from trifix.outputs.runs import Run
 from trifix.outputs.space import space_of
-from trifix.outputs.summary import Summary
-from trifix.records import PositionedReason, Reason, ReferenceMap
+from trifix.records import Reason, ReferenceMap
 
 SIGMAS = 5.0
 """Two targets nearest to each other are the same if they are no further apart than this (standard deviations)."""
@@ -35,36 +31,6 @@ _LEAST_SIGMA_MM = 0.05  # of a difference between two maps, whose worlds are ali
 _SAME_WORLD_MM = 1.0  # targets given with one number are in one world if they are as near as this
 _MOST_WORST = 5
 _PRINTED_MM = 1e-6  # poses.csv tells no smaller difference
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Run:
-    """What a results folder holds."""
-
-    path: Path
-    """The folder."""
-    summary: Summary
-    """The run in numbers."""
-    course: Course
-    """What became of every frame."""
-    timestamp_ns: Int[np.ndarray, "n"]
-    """When each of them was taken (ns)."""
-    reason: tuple[str, ...]
-    """Why each was refused, or what is special about its pose; mostly empty."""
-    poses: Mapping[int, Pose]
-    """``T_world_sensor`` of each positioned frame, by its number."""
-    cov: Mapping[int, Float[np.ndarray, "6 6"]]
-    """Covariance of each pose (mm, rad)."""
-    map: ReferenceMap
-    """The targets."""
-    identified: tuple[Int[np.ndarray, "_"], ...]
-    """Identities of the targets that each frame showed."""
-
-    @property
-    def world(self) -> int | None:
-        """Number of the frame that defines the world; None if the map was given, or nothing was found."""
-        name = PositionedReason.defines_world.name
-        return int(self.course.frame[self.reason.index(name)]) if name in self.reason else None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -178,46 +144,6 @@ class Comparison:
     """Options that differ, by their full names."""
     versions: dict[str, tuple[object, object]]
     """Versions that differ."""
-
-
-def read_run(path: Path) -> Run:
-    """What a results folder holds.
-
-    Raises:
-        RecordingError: it is no results folder, or something in it is missing or broken.
-    """
-    summary = _read_summary(path / "summary.json")
-    columns = {"frame": int, "timestamp_ns": int, "status": str, "points": int, "matched": int}
-    table = read_table(path / "frames.csv", columns, {"reason": str, "residual_mm": float})
-    reasons = table.get("reason", np.full(len(table["frame"]), "", dtype=object))
-    frames, _, poses, covs = read_poses(path / "poses.csv")
-    by_frame = dict(zip(frames.tolist(), poses, strict=True))
-    of_frame = [by_frame.get(frame) for frame in table["frame"].tolist()]
-    n, nowhere = len(of_frame), np.full(3, np.nan)
-    outcome = [
-        reason if status == "refused" else "positioned" for status, reason in zip(table["status"], reasons, strict=True)
-    ]
-    course = Course(
-        frame=table["frame"],
-        outcome=outcome,
-        points=table["points"],
-        matched=table["matched"],
-        residual_mm=np.where([T is None for T in of_frame], np.nan, table.get("residual_mm", np.full(n, np.nan))),
-        position_mm=np.array([nowhere if T is None else T.t_mm for T in of_frame]).reshape(n, 3),
-        down=np.array([nowhere if T is None else T.R[:, 1] for T in of_frame]).reshape(n, 3),
-        forward=np.array([nowhere if T is None else T.R[:, 2] for T in of_frame]).reshape(n, 3),
-    )
-    return Run(
-        path=path,
-        summary=summary,
-        course=course,
-        timestamp_ns=table["timestamp_ns"],
-        reason=tuple(reasons.tolist()),
-        poses=by_frame,
-        cov=dict(zip(frames.tolist(), covs, strict=True)),
-        map=read_map(path / "map.csv"),
-        identified=_identified(path / "sightings.csv", table["frame"]),
-    )
 
 
 def differences(first: Run, second: Run) -> Differences:
@@ -386,7 +312,7 @@ def write_comparison(comparison: Comparison, first: Run, second: Run, path: Path
                 {
                     "path": run.path,
                     "is_finished": run.summary.finished,
-                    "space": space_of(run.course, run.map, None, run.identified, run.summary.advice),
+                    "space": space_of(run.course, run.map, None, run.identified(), run.summary.advice),
                     "time_figure": time_figure(run.course) if len(run.course.frame) else "",
                     "path_figure": path_figure(run.course, run.map) if len(run.course.frame) else "",
                 }
@@ -399,28 +325,6 @@ def write_comparison(comparison: Comparison, first: Run, second: Run, path: Path
         write_atomically(path, text)
     except OSError as error:
         raise RecordingError(f"{path} cannot be written ({error.strerror}): name another file.") from error
-
-
-def _read_summary(file: Path) -> Summary:
-    folder = file.parent
-    if not folder.is_dir():
-        raise RecordingError(f"{folder} is not a folder, expected results that `trifix run` wrote.")
-    try:
-        return msgspec.json.decode(file.read_bytes(), type=Summary)
-    except FileNotFoundError:
-        raise RecordingError(f"{folder} holds no {file.name}: expected results that `trifix run` wrote.") from None
-    except OSError as fault:
-        raise RecordingError(f"{file} cannot be read: {fault.strerror}.") from None
-    except msgspec.DecodeError as fault:
-        raise RecordingError(f"{file} is no summary of a run ({fault}): run the recording again.") from None
-
-
-def _identified(file: Path, frames: Int[np.ndarray, "n"]) -> tuple[Int[np.ndarray, "_"], ...]:
-    """Targets that were identified in each of the frames, each once."""
-    sightings = read_table(file, {"frame": int, "target": int})
-    frame, target = np.unique(np.stack([sightings["frame"], sightings["target"]]), axis=1)
-    first, end = np.searchsorted(frame, frames), np.searchsorted(frame, frames, side="right")
-    return tuple(target[a:b] for a, b in zip(first.tolist(), end.tolist(), strict=True))
 
 
 def _common_frames(first: Run, second: Run) -> list[int]:

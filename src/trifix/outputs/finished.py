@@ -1,4 +1,4 @@
-"""A results folder, read back to be looked at frame by frame. Judges nothing again; asks a recording for its images."""
+"""A finished run, to be looked at frame by frame. Judges nothing again; asks a recording for its images."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,8 +12,8 @@ from trifix.files.tables import Table, read_table
 from trifix.geometry.camera import Camera, StereoRig
 from trifix.geometry.pose import Pose
 from trifix.outputs.advice import Advice, advice_on
-from trifix.outputs.comparison import read_run
 from trifix.outputs.moments import Moment, Shot, event_words, sigma_of
+from trifix.outputs.runs import read_run
 from trifix.outputs.samples import HEIGHT_PX, KINDS, WIDTH_PX, points_by_kind
 from trifix.records import (
     Fix,
@@ -52,7 +52,7 @@ class FinishedRun:
             RecordingError: the folder holds no results, or none yet, or the recording is another one.
             MapError: its map cannot be read.
         """
-        run = read_run(out)
+        self._run = run = read_run(out)
         self.name, self.is_finished = run.summary.recording, run.summary.finished
         self.frames_per_s = run.summary.frames_per_s
         self.course, self.targets = run.course, run.map
@@ -62,17 +62,8 @@ class FinishedRun:
         """Names of the frames' reasons, empty where there is none."""
         self.poses: tuple[Pose | None, ...] = tuple(run.poses.get(frame) for frame in self.course.frame.tolist())
         """Their poses, None where refused."""
-        self._timestamp_ns, self._cov = run.timestamp_ns, run.cov
-        self._frames = read_table(
-            out / "frames.csv", {"frame": int}, {"detail": str, "residual_mm": float, "p_chance": float}
-        )
-        self._sightings = read_table(
-            out / "sightings.csv",
-            {"frame": int, "kind": str, "row": int, "target": int},
-            {"residual_mm": float, "residual_px": float},
-        )
-        self._of_frame = _rows_of(self._sightings["frame"])
-        self._of_target = _rows_of(self._sightings["target"])
+        self._of_frame = _rows_of(run.sightings["frame"])
+        self._of_target = _rows_of(run.sightings["target"])
         self._events = _events(out)
         self._total_ms = _timings(out)
         self._recording = None
@@ -107,7 +98,7 @@ class FinishedRun:
     def sightings(self, target: int) -> Sightings:
         """Where a target was identified; nowhere, if there is no such target."""
         rows = self._of_target.get(target, np.zeros(0, dtype=np.int64))
-        table = self._sightings
+        table = self._run.sightings
         nan = np.full(len(table["frame"]), np.nan)
         mm, px = table.get("residual_mm", nan)[rows], table.get("residual_px", nan)[rows]
         frames, first, inverse = np.unique(table["frame"][rows], return_index=True, return_inverse=True)
@@ -120,24 +111,24 @@ class FinishedRun:
 
     def moment(self, k: int) -> Moment:
         """What is shown of the k-th frame."""
-        index, unknown = int(self.course.frame[k]), float("nan")
+        run, index = self._run, int(self.course.frame[k])
         rows = self._of_frame.get(index, np.zeros(0, dtype=np.int64))
         seen = None
         if self._recording is not None and index in self._at:
             seen = self._recording.frame(self._at[index])
         return Moment(
             frame=index,
-            timestamp_ns=int(self._timestamp_ns[k]),
+            timestamp_ns=int(run.timestamp_ns[k]),
             pose=self.poses[k] or self._last_pose(k),
             is_positioned=self.poses[k] is not None,
             reason=self.reason[k],
-            detail=str(self._frames["detail"][k]) if "detail" in self._frames else "",
+            detail=run.detail[k],
             points=int(self.course.points[k]),
             matched=int(self.course.matched[k]),
-            residual_mm=float(self._frames["residual_mm"][k]) if "residual_mm" in self._frames else unknown,
-            p_chance=float(self._frames["p_chance"][k]) if "p_chance" in self._frames else unknown,
-            sigma_mm=sigma_of(self._cov[index]) if index in self._cov else unknown,
-            targets=np.unique(self._sightings["target"][rows]),
+            residual_mm=float(run.residual_mm[k]),
+            p_chance=float(run.p_chance[k]),
+            sigma_mm=sigma_of(run.cov[index]) if index in run.cov else float("nan"),
+            targets=np.unique(run.sightings["target"][rows]),
             rig=None if seen is None else seen.rig,
             shots=() if seen is None else self._shots(seen, k, rows),
             advice=self._advice(k, None if seen is None else seen.rig),
@@ -157,7 +148,7 @@ class FinishedRun:
 
     def _shots(self, seen: Frame, k: int, rows: Int[np.ndarray, "s"]) -> tuple[Shot, ...]:
         """What the cameras saw, with its dots by what became of them."""
-        kind, row = self._sightings["kind"][rows], self._sightings["row"][rows]
+        kind, row = self._run.sightings["kind"][rows], self._run.sightings["row"][rows]
         identified = {name: set(row[kind == name].tolist()) for name in ("left", "right", "point")}
         match seen.content:
             case StereoImages() as images if seen.rig is not None:

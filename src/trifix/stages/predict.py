@@ -79,3 +79,11 @@ def predict(motion: Motion | None, timestamp_ns: int, options: PredictOptions) -
             turned = Prediction(motion.newest, np.diag(sigma**2 + any_way**2))
             return Prediction(motion.newest @ Pose.exp(pace), np.diag(sigma**2), turned)
     return Prediction(motion.newest, np.diag(resting**2))
+
+
+def across(link: Prediction, T: Pose, is_to_world: bool) -> Prediction:
+    """Where a sensor is in the world whose pose on an island is known, or the other way round."""
+    T_world_island = link.T_world_sensor
+    there = T_world_island @ T if is_to_world else T_world_island.inverse() @ T
+    A = (T if is_to_world else there).inverse().adjoint()
+    return Prediction(there, A @ link.cov @ A.T)

@@ -218,10 +218,7 @@ def verify(
         return NoFix(Reason.no_candidate, "Every hypothesis looks at targets from behind or has its points on a line.")
     best = min(found, key=lambda each: each.p_chance)
     if best.p_chance > options.max_p_chance:
-        detail = (
-            f"{len(best.point)} of {len(evidence.points)} points agree with the map to {best.rms_mm:.2f} mm; "
-            f"by chance so in up to {best.p_chance:.1e} of such frames."
-        )
+        detail = _agreement(best, len(evidence.points))
         return NoFix(Reason.not_proven, detail, best.p_chance, len(best.point), best.rms_mm)
     found += weighed.rivals(found, best)
     weighed.doubt_labels(found)
@@ -586,6 +583,18 @@ class _Weighed:
             detail = f"{len(best.point)} points and {len(seen)} dots of a single camera, near where the motion leads."
             fix = replace(fix, reason=PositionedReason.few_points, detail=detail)
         return fix
+
+
+def _agreement(best: Solution, points: int) -> str:
+    """What agrees with the map and yet proves nothing, in words."""
+    count, single = len(best.point), int((best.dot_target >= 0).sum())
+    dots = f"{single} {'dot' if single == 1 else 'dots'} of a single camera"
+    if count == 0:
+        return f"Only {dots} agree with the map." if single else "No point agrees with the map." if points else ""
+    what = f"{count} of {points} points{f' and {dots}' if single else ''} agree with the map to {best.rms_mm:.2f} mm"
+    if best.p_chance < 1:
+        return f"{what}; by chance so in up to {best.p_chance:.1e} of such frames."
+    return f"{what}, as by chance they may."
 
 
 def fewest_points(index: MapIndex, points: SensorPoints, map: ReferenceMap, options: VerifyOptions) -> int:
