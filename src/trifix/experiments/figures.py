@@ -4,7 +4,6 @@ Drawn in the colours of a light page; ``for_page`` lets an SVG take those of the
 """
 
 import io
-import re
 from collections.abc import Sequence
 
 import matplotlib as mpl
@@ -19,6 +18,7 @@ from matplotlib.ticker import MaxNLocator
 
 from trifix.experiments.acceptance import Acceptance
 from trifix.experiments.measuring import Part, growth, slope
+from trifix.outputs import figures
 from trifix.records import ReferenceMap
 from trifix.stages.identify.congruence import IdentifyOptions
 from trifix.stages.identify.delaunay import DelaunayTriangles
@@ -40,30 +40,9 @@ _LINES = {
     "distances": ("#e69f00", "--"),
     "icp": ("#8a929b", ":"),
 }
-_STYLE = {
-    "svg.fonttype": "none",
-    "svg.hashsalt": "trifix",
+_STYLE = figures.style_of(_INK, _FAINT, _GRID) | {
     "figure.facecolor": _PAGE,
     "axes.facecolor": _PAGE,
-    "font.family": "sans-serif",
-    "font.size": 9.5,
-    "axes.titlesize": 10,
-    "axes.titlelocation": "left",
-    "axes.titlecolor": _INK,
-    "text.color": _INK,
-    "axes.edgecolor": _GRID,
-    "axes.labelcolor": _FAINT,
-    "xtick.color": _GRID,
-    "ytick.color": _GRID,
-    "xtick.labelcolor": _FAINT,
-    "ytick.labelcolor": _FAINT,
-    "grid.color": _GRID,
-    "grid.linewidth": 0.6,
-    "axes.grid": True,
-    "axes.axisbelow": True,
-    "axes.spines.top": False,
-    "axes.spines.right": False,
-    "legend.frameon": False,
     "legend.labelcolor": _INK,
 }
 _LIGHT = np.array([0.5, 0.35, 0.8]) / np.linalg.norm([0.5, 0.35, 0.8])
@@ -89,10 +68,7 @@ def png_of(figure: Figure) -> bytes:
 
 def for_page(svg: str) -> str:
     """An SVG as part of a page: in its colours, in its font."""
-    svg = re.sub(r"^.*?(?=<svg)|<defs>\s*<style.*?</defs>|font-family: [^;]*; ?", "", svg, flags=re.DOTALL)
-    for colour, name in _VARIABLES.items():
-        svg = svg.replace(colour, f"var(--{name})")
-    return svg
+    return figures.for_page(svg, _VARIABLES)
 
 
 # --- acceptance ------------------------------------------------------------------------------------------------------

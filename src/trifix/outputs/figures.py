@@ -2,7 +2,7 @@
 
 import io
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import matplotlib as mpl
@@ -20,28 +20,35 @@ from trifix.records import ReferenceMap, TargetState
 INK, FAINT, GRID, GOOD, BAD, PATH = (f"#0102{k:02x}" for k in range(1, 7))
 _VARIABLES = {INK: "ink", FAINT: "faint", GRID: "grid", GOOD: "good", BAD: "bad", PATH: "path"}
 
-STYLE = {
-    "svg.fonttype": "none",  # text stays text
-    "svg.hashsalt": "trifix",  # the same figure has the same bytes
-    "font.family": "sans-serif",
-    "font.size": 9.5,
-    "axes.titlesize": 10,
-    "axes.titlelocation": "left",
-    "axes.titlecolor": INK,
-    "text.color": INK,
-    "axes.edgecolor": GRID,
-    "axes.labelcolor": FAINT,
-    "xtick.color": GRID,
-    "ytick.color": GRID,
-    "xtick.labelcolor": FAINT,
-    "ytick.labelcolor": FAINT,
-    "grid.color": GRID,
-    "grid.linewidth": 0.6,
-    "axes.grid": True,
-    "axes.axisbelow": True,
-    "axes.spines.top": False,
-    "axes.spines.right": False,
-    "legend.frameon": False,
+
+def style_of(ink: str, faint: str, grid: str) -> dict[str, object]:
+    """Settings of matplotlib in which all figures are drawn, in some colours."""
+    return {
+        "svg.fonttype": "none",  # text stays text
+        "svg.hashsalt": "trifix",  # the same figure has the same bytes
+        "font.family": "sans-serif",
+        "font.size": 9.5,
+        "axes.titlesize": 10,
+        "axes.titlelocation": "left",
+        "axes.titlecolor": ink,
+        "text.color": ink,
+        "axes.edgecolor": grid,
+        "axes.labelcolor": faint,
+        "xtick.color": grid,
+        "ytick.color": grid,
+        "xtick.labelcolor": faint,
+        "ytick.labelcolor": faint,
+        "grid.color": grid,
+        "grid.linewidth": 0.6,
+        "axes.grid": True,
+        "axes.axisbelow": True,
+        "axes.spines.top": False,
+        "axes.spines.right": False,
+        "legend.frameon": False,
+    }
+
+
+STYLE = style_of(INK, FAINT, GRID) | {
     "lines.solid_capstyle": "round",
     "path.simplify": False,  # it would drop lone points
 }
@@ -237,7 +244,12 @@ def svg_of(figure: Figure) -> str:
     text = io.StringIO()
     FigureCanvasSVG(figure)
     figure.savefig(text, format="svg", transparent=True, metadata=dict.fromkeys(("Date", "Creator", "Format", "Type")))
-    svg = re.sub(r"^.*?(?=<svg)|<defs>\s*<style.*?</defs>|font-family: [^;]*; ?", "", text.getvalue(), flags=re.DOTALL)
-    for colour, name in _VARIABLES.items():
+    return for_page(text.getvalue(), _VARIABLES)
+
+
+def for_page(svg: str, variables: Mapping[str, str]) -> str:
+    """An SVG as part of a page: in its font, and with the page's variables in the place of colours."""
+    svg = re.sub(r"^.*?(?=<svg)|<defs>\s*<style.*?</defs>|font-family: [^;]*; ?", "", svg, flags=re.DOTALL)
+    for colour, name in variables.items():
         svg = svg.replace(colour, f"var(--{name})")
     return svg
