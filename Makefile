@@ -1,4 +1,12 @@
 # A fresh Debian with git, make and Python 3.11 is enough: each target does its own set-up.
+#
+#   make demo         simulate a small recording, position it, write a report
+#   make test         the tests
+#   make check        what every change must pass: format, lint, types, imports, documentation, tests with coverage
+#   make bench        short benchmarks against benchmarks/baseline.json
+#   make docs         the documentation as a site, in site/
+#   make setup        the environment in .venv, from requirements.lock
+#   make lock         requirements.lock anew, after a change of pyproject.toml; make check-lock says whether it is due
 
 PYTHON ?= python3
 V := .venv
