@@ -134,7 +134,7 @@ def test_fewer_than_three_points_are_too_few(world, count, level):
         refused(Positioner(map=map, is_noise_stated=True).step(frame_of(0, content)), Reason.too_few_points)
 
 
-def test_points_of_which_none_agrees_are_said_to_in_words(world):
+def test_how_few_points_there_are_is_said_in_words(world):
     rng = np.random.default_rng(1)
     T = looking(rng)
     dots = seen_dots(T.inverse().apply(world), rng)

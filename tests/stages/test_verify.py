@@ -24,6 +24,7 @@ from constellations import (
     some_points,
 )
 from trifix.errors import ConfigError
+from trifix.geometry.pose import Pose
 from trifix.records import (
     Fix,
     Identification,
@@ -35,7 +36,7 @@ from trifix.records import (
     TargetState,
 )
 from trifix.stages.orient import orient
-from trifix.stages.verify import Evidence, VerifyOptions, verify
+from trifix.stages.verify import Evidence, Solution, VerifyOptions, _agreement, verify
 
 
 def judged(
@@ -209,6 +210,26 @@ def test_the_required_proof_is_an_option():
     assert answer.why is Reason.not_proven
     assert 1e-4 * p < answer.p_chance <= p
     assert "of 12 points agree" in answer.detail
+
+
+@pytest.mark.parametrize(
+    ("count", "single", "p_chance", "detail"),
+    [
+        (0, 0, 1.0, "No point agrees with the map."),
+        (0, 2, 1.0, "Only 2 dots of a single camera agree with the map."),
+        (3, 0, 1.0, "3 of 9 points agree with the map to 0.50 mm, as by chance they may."),
+        (
+            5,
+            1,
+            1e-3,
+            "5 of 9 points and 1 dot of a single camera agree with the map to 0.50 mm; by chance so in up to ",
+        ),
+    ],
+)
+def test_what_proves_nothing_is_said_in_words(count, single, p_chance, detail):
+    mm, dots = np.full(count, 0.5), np.arange(4) - 4 + single
+    solution = Solution(Pose.identity(), np.eye(6), np.arange(9), dots, np.arange(count), mm, mm, 0.0, 0.0, p_chance)
+    assert _agreement(solution, 9).startswith(detail)
 
 
 def test_without_hypotheses_there_is_no_candidate():
