@@ -1,8 +1,9 @@
-"""Calibrate a stereo rig from sightings of a flat board of which every point's place is known.
+"""Calibrate a stereo rig from sightings of a board, whose points are about where they are meant to be.
 
 OpenCV finds each camera (Zhang 2000) and how they stand to one another; then one least squares over both cameras, their
 relative pose and all poses of the board uses every point, also those that one camera alone has seen, and tells how
-uncertain the result is. Knows no image: who found the points, and on what board, is not its concern.
+uncertain the result is. Where there are views enough, the places of the board's points are sought as well. Knows no
+image: who found the points, and on what board, is not its concern.
 """
 
 from collections.abc import Sequence
@@ -22,6 +23,8 @@ LEAST_VIEWS = 3
 """Fewer poses of a flat board do not determine a camera (Zhang 2000, section 3.1)."""
 LEAST_POINTS = 6
 """Fewer points of a board in one image say too little."""
+ENOUGH_VIEWS = 5
+"""In fewer views the board's points are held where they are meant to be."""
 OUTLIER = 3.0
 """A view is left out when its rms residual exceeds that of half of the views by this factor."""
 
@@ -29,6 +32,7 @@ _WORST_FOCAL = 0.02  # standard deviation of a focal length, relative, at which 
 _CAMERA = 8  # parameters of a camera; six of the pose follow those of both
 _RIG = 2 * _CAMERA + 6
 _SETTLED = 1e-10  # relative decrease of the cost below which the minimum is reached
+_AGREED = 0.02  # relative change of the ratio of both variances below which it is found
 _UNDAMPED = 1e-9  # share of its curvature, added to a direction, that no longer shortens the step
 
 # OpenCV 4 keeps them in its module for these lenses, OpenCV 5 with all others; their values differ.
@@ -38,6 +42,9 @@ _FISHEYE_FLAGS = sum(
 )
 
 Model = Literal["radtan", "equidistant"]
+
+PITCH_SIGMA = 1e-4
+"""How well a board's pitch is known (relative): a caliper's 0.02 mm over 200 mm."""
 
 PARAMETERS = tuple(
     f"{side}.{name}" for side in ("left", "right") for name in ("fu", "fv", "pu", "pv", "c1", "c2", "c3", "c4")
@@ -102,7 +109,7 @@ class Calibration:
     image_sigma_px: float
     """Standard deviation per coordinate of a point in an image (px)."""
     board_sigma_mm: float
-    """Standard deviation per coordinate of a point on the board (mm), from what its images have in common."""
+    """Standard deviation per coordinate of a point on the board (mm), from what its images have in common, or given."""
     views: tuple[BoardView, ...]
     """All views that were given."""
     is_left_out: Bool[np.ndarray, "v"]
@@ -111,6 +118,17 @@ class Calibration:
     """Pose of the board in each view."""
     residuals: Residuals
     """Of all points, also those of views left out."""
+    board_cell: Int[np.ndarray, "n 2"]
+    """Column and row of each of the board's points."""
+    board_mm: Float[np.ndarray, "n 3"]
+    """By how much each is out of place, in board coordinates (mm); zero where that was not sought."""
+    scale_sigma: float
+    """Standard deviation of the board's size, relative: all lengths are as right as this. Part of the covariance."""
+
+    @property
+    def is_board_sought(self) -> bool:
+        """Whether the places of the board's points were unknowns."""
+        return bool(self.board_mm.any())
 
     @property
     def sigma(self) -> Float[np.ndarray, "22"]:
@@ -168,8 +186,14 @@ def calibrate(
     right_size_px: tuple[int, int],
     model: Model = "radtan",
     may_leave_out: bool = True,
+    board_sigma_mm: float | None = None,
+    pitch_sigma: float = PITCH_SIGMA,
 ) -> Calibration:
     """The rig that explains all views, but for those whose residuals stand out.
+
+    The board's points may be out of place by ``board_sigma_mm`` per coordinate, None for as much as the residuals tell,
+    0 for holding them where they are meant to be, as fewer than ``ENOUGH_VIEWS`` views do. ``pitch_sigma`` is how well
+    the pitch is known, relative.
 
     Sizes are (width, height). Left out is one view at a time, the worst, as long as it exceeds ``OUTLIER`` times the
     median and half of the views remain.
@@ -188,28 +212,36 @@ def calibrate(
     while True:
         kept = np.flatnonzero(is_kept).tolist()
         rig = _start([views[v] for v in kept], pitch_mm, left_size_px, right_size_px, model)
-        poses = [_board_pose(rig, view, pitch_mm) for view in views]
-        observed = observed.with_radius(rig, poses)
-        rig, poses = _adjust(rig, poses, observed, is_kept)
-        error_px = _errors(rig, poses, observed)
+        poses = tuple(_board_pose(rig, view, pitch_mm) for view in views)
+        fit = _Fit(rig, poses, np.zeros_like(observed.printed_mm))
+        observed = observed.with_radius(fit)
+        fit = _adjust(fit, observed, is_kept)
+        uncertainty = _uncertainty(fit, observed, is_kept)
+        if len(kept) >= ENOUGH_VIEWS and board_sigma_mm != 0.0:
+            fit, uncertainty = _seek_board(fit, observed, is_kept, uncertainty, board_sigma_mm)
+        error_px = _errors(fit, observed)
         rms_px = np.array([_rms(error_px[observed.view == v]) for v in range(len(views))])
         worst = max(kept, key=lambda v: float(rms_px[v]))
         is_enough = sum(views[v].is_pair for v in kept if v != worst) >= max(LEAST_VIEWS, pairs / 2)
         if not (may_leave_out and is_enough and rms_px[worst] > OUTLIER * np.median(rms_px[kept])):
             break
         is_kept[worst] = False
-    uncertainty = _uncertainty(rig, poses, observed, is_kept)
-    _refuse_vague(rig, uncertainty.cov, len(kept))
-    residuals = Residuals(observed.view, observed.camera, observed.cell, observed.uv_px, error_px)
+    _refuse_vague(fit.rig, uncertainty.cov, len(kept))
+    size_mm = np.linalg.norm(observed.printed_mm - observed.printed_mm.mean(axis=0))
+    cov, T = uncertainty.cov.copy(), fit.rig.T_right_left
+    cov[-6:-3, -6:-3] += pitch_sigma**2 * np.outer(T.R.T @ T.t_mm, T.R.T @ T.t_mm)  # of all the baseline alone scales
     return Calibration(
-        rig,
-        uncertainty.cov,
-        uncertainty.image_sigma_px,
-        uncertainty.board_sigma_mm,
-        tuple(views),
-        ~is_kept,
-        tuple(poses),
-        residuals,
+        rig=fit.rig,
+        cov=cov,
+        image_sigma_px=uncertainty.image_sigma_px,
+        board_sigma_mm=uncertainty.board_sigma_mm,
+        views=tuple(views),
+        is_left_out=~is_kept,
+        T_left_board=fit.poses,
+        residuals=Residuals(observed.view, observed.camera, observed.cell, observed.uv_px, error_px),
+        board_cell=observed.board_cell,
+        board_mm=fit.board_mm,
+        scale_sigma=float(np.hypot(pitch_sigma, uncertainty.board_sigma_mm / size_mm)),
     )
 
 
@@ -232,10 +264,14 @@ class _Observed:
     view: Int[np.ndarray, "m"]
     camera: Int[np.ndarray, "m"]
     cell: Int[np.ndarray, "m 2"]
-    xyz_mm: Float[np.ndarray, "m 3"]
-    """Board coordinates."""
+    place: Int[np.ndarray, "m"]
+    """Row among the board's points."""
     uv_px: Float[np.ndarray, "m 2"]
     radius_px: Float[np.ndarray, "m"]
+    board_cell: Int[np.ndarray, "n 2"]
+    """Column and row of each of the board's points."""
+    printed_mm: Float[np.ndarray, "n 3"]
+    """Where they are meant to be."""
     radius_mm: float = 0.0
     """Radius of the dots; zero for corners."""
 
@@ -249,20 +285,40 @@ class _Observed:
         ]
         count = [len(sighting.uv_px) for _, _, sighting in seen]
         cell = np.concatenate([sighting.cell for _, _, sighting in seen])
+        board_cell, place = np.unique(cell, axis=0, return_inverse=True)
         return _Observed(
             view=np.repeat([v for v, _, _ in seen], count),
             camera=np.repeat([camera for _, camera, _ in seen], count),
             cell=cell,
-            xyz_mm=_on_board(cell, pitch_mm),
+            place=place.ravel(),
             uv_px=np.concatenate([sighting.uv_px for _, _, sighting in seen]),
             radius_px=np.concatenate([sighting.radius_px for _, _, sighting in seen]),
+            board_cell=board_cell,
+            printed_mm=_on_board(board_cell, pitch_mm),
         )
 
-    def with_radius(self, rig: StereoRig, poses: Sequence[Pose]) -> "_Observed":
+    def with_radius(self, fit: "_Fit") -> "_Observed":
         """The same, the dots as large as most of them look: a tilted circle's image has the long semi-axis r f / z."""
-        xyz = _in_cameras(rig, poses, self)[0]
-        focal_px = np.array([np.sqrt(c.fu_px * c.fv_px) for c in (rig.left, rig.right)])[self.camera]
+        xyz = _in_cameras(fit, self)[0]
+        focal_px = np.array([np.sqrt(c.fu_px * c.fv_px) for c in (fit.rig.left, fit.rig.right)])[self.camera]
         return replace(self, radius_mm=float(np.median(self.radius_px * xyz[:, 2] / focal_px)))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Fit:
+    """What is sought."""
+
+    rig: StereoRig
+    poses: tuple[Pose, ...]
+    """T_left_board of each view."""
+    board_mm: Float[np.ndarray, "n 3"]
+    """By how much each point of the board is out of place."""
+
+    def moved(self, shared: Float[np.ndarray, "s"], of_poses: Float[np.ndarray, "v 6"]) -> "_Fit":
+        """The fit after a step of rig and board, if that may move, and one of each pose."""
+        board_mm = self.board_mm + shared[_RIG:].reshape(-1, 3) if len(shared) > _RIG else self.board_mm
+        poses = tuple(pose @ Pose.exp(step) for pose, step in zip(self.poses, of_poses, strict=True))
+        return _Fit(_moved(self.rig, shared[:_RIG]), poses, board_mm)
 
 
 def _on_board(cell: Int[np.ndarray, "n 2"], pitch_mm: float) -> Float[np.ndarray, "n 3"]:
@@ -388,21 +444,18 @@ def _board_pose(rig: StereoRig, view: BoardView, pitch_mm: float) -> Pose:
     return best
 
 
-def _adjust(
-    rig: StereoRig, poses: list[Pose], observed: _Observed, is_kept: Bool[np.ndarray, "v"]
-) -> tuple[StereoRig, list[Pose]]:
-    """Least squares over rig and poses (Levenberg-Marquardt, the poses eliminated).
+def _adjust(fit: _Fit, observed: _Observed, is_kept: Bool[np.ndarray, "v"], stiffness: float | None = None) -> _Fit:
+    """Least squares over rig and poses, and over the board where it has a stiffness (px²/mm²).
 
-    Views left out have no say in the rig; their poses follow it.
+    Levenberg-Marquardt, the poses eliminated. Views left out have no say in the rig; their poses follow it.
     """
-    damping, cost = 1e-6, _cost(rig, poses, observed, is_kept)
+    holds = stiffness or 0.0
+    damping, cost = 1e-6, _cost(fit, observed, is_kept, holds)
     for _ in range(100):
-        system = _linearise(rig, poses, observed, is_kept)
+        system = _linearise(fit, observed, is_kept, stiffness)
         while True:
-            rig_step, pose_steps = _solve(system, damping)
-            tried_rig = _moved(rig, rig_step)
-            tried = [pose @ Pose.exp(step) for pose, step in zip(poses, pose_steps, strict=True)]
-            tried_cost = _cost(tried_rig, tried, observed, is_kept)
+            tried = fit.moved(*_solve(system, damping))
+            tried_cost = _cost(tried, observed, is_kept, holds)
             if tried_cost <= cost or damping > 1e6:
                 break
             damping *= 10
@@ -410,10 +463,10 @@ def _adjust(
             break
         # A damped step may be short although the minimum is far, along a valley: it does not end the search.
         is_settled = cost - tried_cost <= _SETTLED * cost and damping < _UNDAMPED
-        rig, poses, cost, damping = tried_rig, tried, tried_cost, damping / 10
+        fit, cost, damping = tried, tried_cost, damping / 10
         if is_settled:
             break
-    return rig, poses
+    return fit
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -425,9 +478,7 @@ class _Uncertainty:
     board_sigma_mm: float
 
 
-def _uncertainty(
-    rig: StereoRig, poses: Sequence[Pose], observed: _Observed, is_kept: Bool[np.ndarray, "v"]
-) -> _Uncertainty:
+def _uncertainty(fit: _Fit, observed: _Observed, is_kept: Bool[np.ndarray, "v"]) -> _Uncertainty:
     """Covariance of the rig where points err in the images, each by itself, and on the board, in all images alike.
 
     Residuals are r = M (ε + G d), with errors ε in the images (σ per coordinate), d on the board (τ), G the derivative
@@ -439,19 +490,19 @@ def _uncertainty(
     and the covariance of all unknowns is σ² (JᵀJ)⁻¹ + τ² (JᵀJ)⁻¹ Jᵀ K J (JᵀJ)⁻¹.
     """
     kept = np.flatnonzero(is_kept).tolist()
-    error_px = _errors(rig, poses, observed)
-    cells, place = np.unique(observed.cell, axis=0, return_inverse=True)
-    unknowns, n = _RIG + 6 * len(kept), 3 * len(cells)
+    error_px = _errors(fit, observed)
+    xyz_mm = observed.printed_mm + fit.board_mm
+    unknowns, n = _RIG + 6 * len(kept), 3 * len(xyz_mm)
     JJ, JG, GG, Gr = np.zeros((unknowns, unknowns)), np.zeros((unknowns, n)), np.zeros((n, n)), np.zeros(n)
     coordinates, squares = 0, 0.0
     for k, v in enumerate(kept):
         own = np.r_[:_RIG, _RIG + 6 * k : _RIG + 6 * k + 6]
         for camera in (0, 1):
             rows = np.flatnonzero((observed.view == v) & (observed.camera == camera))
-            J_rig, J_pose = _jacobians(rig, poses[v], camera, observed.xyz_mm[rows])
+            J_rig, J_pose = _jacobians(fit.rig, fit.poses[v], camera, xyz_mm[observed.place[rows]])
             J, G = np.c_[J_rig, J_pose], np.zeros((2 * len(rows), n))
             for axis in range(3):  # shifts the point as a shift of the board would: the pose's first columns
-                G[np.arange(2 * len(rows)), 3 * np.repeat(place.ravel()[rows], 2) + axis] = J_pose[:, axis]
+                G[np.arange(2 * len(rows)), 3 * np.repeat(observed.place[rows], 2) + axis] = J_pose[:, axis]
             e = error_px[rows].ravel()
             JJ[np.ix_(own, own)] += J.T @ J
             JG[own] += J.T @ G
@@ -476,6 +527,42 @@ def _uncertainty(
     )
 
 
+def _seek_board(
+    fit: _Fit,
+    observed: _Observed,
+    is_kept: Bool[np.ndarray, "v"],
+    held: _Uncertainty,
+    board_sigma_mm: float | None,
+) -> tuple[_Fit, _Uncertainty]:
+    """The fit with the board's points as unknowns (Strobl & Hirzinger 2011), where residuals tell that they err.
+
+    Each coordinate is drawn to where it is meant to be by a prior of variance τ²; what no image tells, the board's
+    place and size, stays there. With P the inverse of the normal equations, γ = n − (σ/τ)² tr P_dd of n coordinates are
+    told by the images, and the variances are those that explain their own estimates (MacKay 1992, section 4):
+
+        τ² = |d|² / γ,    σ² = |r|² / (coordinates found − parameters of rig and poses − γ).
+    """
+    n = observed.printed_mm.size
+    freedom = 2 * int(np.count_nonzero(is_kept[observed.view])) - _RIG - 6 * int(np.count_nonzero(is_kept))
+    image, board = held.image_sigma_px**2, held.board_sigma_mm**2 if board_sigma_mm is None else board_sigma_mm**2
+    if freedom <= n or not board * image > 0.0:
+        return fit, held
+    sought = fit
+    for _ in range(20):
+        stiffness = image / board
+        sought = _adjust(sought, observed, is_kept, stiffness)
+        P = _inverse(_reduced(_linearise(sought, observed, is_kept, stiffness), 0.0)[0])
+        told = n - stiffness * float(np.trace(P[_RIG:, _RIG:]))
+        image = float(np.sum(_errors(sought, observed)[is_kept[observed.view]] ** 2)) / (freedom - told)
+        if board_sigma_mm is None:
+            if told < 1.0:
+                return fit, held
+            board = float(np.sum(sought.board_mm**2)) / told
+        if abs(image / board - stiffness) <= _AGREED * stiffness:
+            break
+    return sought, _Uncertainty(image * P[:_RIG, :_RIG], float(np.sqrt(image)), float(np.sqrt(board)))
+
+
 def _inverse(A: Float[np.ndarray, "n n"]) -> Float[np.ndarray, "n n"]:
     """Inverse of normal equations; very large, not infinite, along what they leave undetermined."""
     scale = 1 / np.sqrt(np.diag(A).clip(1e-300))  # or the units would decide what is undetermined
@@ -485,32 +572,50 @@ def _inverse(A: Float[np.ndarray, "n n"]) -> Float[np.ndarray, "n n"]:
 
 
 _System = tuple[
-    Float[np.ndarray, "22 22"],
-    Float[np.ndarray, "22"],
-    Float[np.ndarray, "v 22 6"],
+    Float[np.ndarray, "s s"],
+    Float[np.ndarray, "s"],
+    Float[np.ndarray, "v s 6"],
     Float[np.ndarray, "v 6 6"],
     Float[np.ndarray, "v 6"],
     Bool[np.ndarray, "v"],
 ]
-"""Normal equations: of the rig, across, and of each pose; and which views have a say in the rig."""
+"""Normal equations: of rig and board, across, and of each pose; and which views have a say in the former."""
 
 
-def _linearise(rig: StereoRig, poses: Sequence[Pose], observed: _Observed, is_kept: Bool[np.ndarray, "v"]) -> _System:
-    error = _errors(rig, poses, observed)
-    n = len(poses)
-    A, g = np.zeros((_RIG, _RIG)), np.zeros(_RIG)
-    B, C, h = np.zeros((n, _RIG, 6)), np.zeros((n, 6, 6)), np.zeros((n, 6))
-    for v, T in enumerate(poses):
+def _linearise(
+    fit: _Fit, observed: _Observed, is_kept: Bool[np.ndarray, "v"], stiffness: float | None = None
+) -> _System:
+    error = _errors(fit, observed)
+    xyz_mm = observed.printed_mm + fit.board_mm
+    views, shared = len(fit.poses), _RIG + (0 if stiffness is None else fit.board_mm.size)
+    A, g = np.zeros((shared, shared)), np.zeros(shared)
+    B, C, h = np.zeros((views, shared, 6)), np.zeros((views, 6, 6)), np.zeros((views, 6))
+    if stiffness is not None:
+        A[range(_RIG, shared), range(_RIG, shared)] = stiffness
+        g[_RIG:] = -stiffness * fit.board_mm.ravel()
+    for v, T in enumerate(fit.poses):
         for camera in (0, 1):
             rows = np.flatnonzero((observed.view == v) & (observed.camera == camera))
-            J_rig, J_pose = _jacobians(rig, T, camera, observed.xyz_mm[rows])
+            J_rig, J_pose = _jacobians(fit.rig, T, camera, xyz_mm[observed.place[rows]])
             e = error[rows].ravel()
             C[v] += J_pose.T @ J_pose
             h[v] += J_pose.T @ e
-            if is_kept[v]:
-                A += J_rig.T @ J_rig
-                g += J_rig.T @ e
-                B[v] += J_rig.T @ J_pose
+            if not is_kept[v]:
+                continue
+            A[:_RIG, :_RIG] += J_rig.T @ J_rig
+            g[:_RIG] += J_rig.T @ e
+            B[v, :_RIG] += J_rig.T @ J_pose
+            if stiffness is not None:
+                # Where a point goes is where a shift of the board would take it: the pose's first columns.
+                J = J_pose.reshape(-1, 2, 6)
+                G = J[:, :, :3]
+                at = _RIG + 3 * observed.place[rows, None] + np.arange(3)
+                A[at[:, :, None], at[:, None, :]] += np.einsum("nka,nkb->nab", G, G)
+                across = np.einsum("nkr,nka->nar", J_rig.reshape(-1, 2, _RIG), G)
+                A[at, :_RIG] += across
+                A[:_RIG, at] += np.moveaxis(across, 2, 0)
+                g[at] += np.einsum("nka,nk->na", G, error[rows])
+                B[v, at] += np.einsum("nka,nkp->nap", G, J)
     return A, g, B, C, h, is_kept
 
 
@@ -557,21 +662,24 @@ def _camera_jacobian(camera: Camera, xyz_mm: Float[np.ndarray, "n 3"]) -> Float[
 
 def _reduced(
     system: _System, damping: float
-) -> tuple[Float[np.ndarray, "22 22"], Float[np.ndarray, "22"], Float[np.ndarray, "v 6 6"]]:
-    """The normal equations of the rig after the poses are eliminated, and the inverse of each pose's own."""
+) -> tuple[Float[np.ndarray, "s s"], Float[np.ndarray, "s"], Float[np.ndarray, "v 6 6"]]:
+    """The normal equations of rig and board after the poses are eliminated, and the inverse of each pose's own."""
     A, g, B, C, h, is_kept = system
     inverse = np.linalg.inv(C + damping * np.einsum("vij,ij->vij", C, np.eye(6)))
-    kept = np.flatnonzero(is_kept)
-    S = A + damping * np.diag(np.diag(A)) - np.einsum("vik,vkl,vjl->ij", B[kept], inverse[kept], B[kept])
-    return S, g - np.einsum("vik,vkl,vl->i", B[kept], inverse[kept], h[kept]), inverse
+    across = np.moveaxis(B[is_kept], 0, 1).reshape(len(A), -1)
+    by_pose = np.moveaxis(B[is_kept] @ inverse[is_kept], 0, 1).reshape(len(A), -1)
+    return A + damping * np.diag(np.diag(A)) - by_pose @ across.T, g - by_pose @ h[is_kept].ravel(), inverse
 
 
-def _solve(system: _System, damping: float) -> tuple[Float[np.ndarray, "22"], Float[np.ndarray, "v 6"]]:
-    """The step of the rig and of each pose; those of views left out only seek their own minimum."""
+def _solve(system: _System, damping: float) -> tuple[Float[np.ndarray, "s"], Float[np.ndarray, "v 6"]]:
+    """The step of rig and board, and of each pose; those of views left out only seek their own minimum."""
     _, _, B, _, h, _ = system
     S, g, inverse = _reduced(system, damping)
     scale = 1 / np.sqrt(np.diag(S).clip(1e-300))
-    step = scale * np.linalg.lstsq(S * scale * scale[:, None], scale * g, rcond=1e-14)[0]
+    if len(S) == _RIG:
+        step = scale * np.linalg.lstsq(S * scale * scale[:, None], scale * g, rcond=1e-14)[0]
+    else:
+        step = scale * np.linalg.solve(S * scale * scale[:, None], scale * g)
     return step, np.einsum("vkl,vl->vk", inverse, h - np.einsum("vik,i->vk", B, step))
 
 
@@ -593,21 +701,20 @@ def parameters_of(camera: Camera) -> Float[np.ndarray, "8"]:
     return np.array([camera.fu_px, camera.fv_px, camera.pu_px, camera.pv_px, *camera.coefficients])
 
 
-def _errors(rig: StereoRig, poses: Sequence[Pose], observed: _Observed) -> Float[np.ndarray, "m 2"]:
+def _errors(fit: _Fit, observed: _Observed) -> Float[np.ndarray, "m 2"]:
     """Found less projected (px)."""
-    seen = _ellipse_centres(*_in_cameras(rig, poses, observed), observed.radius_mm)
-    projected = np.where(observed.camera[:, None] == 0, rig.left.project(seen), rig.right.project(seen))
+    seen = _ellipse_centres(*_in_cameras(fit, observed), observed.radius_mm)
+    projected = np.where(observed.camera[:, None] == 0, fit.rig.left.project(seen), fit.rig.right.project(seen))
     return np.asarray(observed.uv_px - projected)
 
 
-def _in_cameras(
-    rig: StereoRig, poses: Sequence[Pose], observed: _Observed
-) -> tuple[Float[np.ndarray, "m 3"], Float[np.ndarray, "m 3 3"]]:
+def _in_cameras(fit: _Fit, observed: _Observed) -> tuple[Float[np.ndarray, "m 3"], Float[np.ndarray, "m 3 3"]]:
     """Each point and the axes of its board in the coordinates of the camera that has seen it."""
-    T = [(pose, rig.T_right_left @ pose) for pose in poses]
+    T = [(pose, fit.rig.T_right_left @ pose) for pose in fit.poses]
     R = np.array([[each.R for each in both] for both in T])[observed.view, observed.camera]
     t_mm = np.array([[each.t_mm for each in both] for both in T])[observed.view, observed.camera]
-    return np.einsum("nij,nj->ni", R, observed.xyz_mm) + t_mm, R
+    xyz_mm = (observed.printed_mm + fit.board_mm)[observed.place]
+    return np.einsum("nij,nj->ni", R, xyz_mm) + t_mm, R
 
 
 def _ellipse_centres(
@@ -624,7 +731,7 @@ def _ellipse_centres(
     return np.asarray(xyz_mm - radius_mm**2 / z * np.einsum("nik,nk->ni", R[:, :, :2], R[:, 2, :2]))
 
 
-def _cost(rig: StereoRig, poses: Sequence[Pose], observed: _Observed, is_kept: Bool[np.ndarray, "v"]) -> float:
-    """Sum of squares over the views that have a say; infinite where a point is not before its camera."""
-    cost = float(np.sum(_errors(rig, poses, observed)[is_kept[observed.view]] ** 2))
+def _cost(fit: _Fit, observed: _Observed, is_kept: Bool[np.ndarray, "v"], stiffness: float) -> float:
+    """Sum of squares over the views that have a say, and of the board; infinite where a point is behind its camera."""
+    cost = float(np.sum(_errors(fit, observed)[is_kept[observed.view]] ** 2) + stiffness * np.sum(fit.board_mm**2))
     return cost if np.isfinite(cost) else np.inf
