@@ -1,6 +1,7 @@
 """A small rig and the poses in which it is shown a board, for the tests of calibration."""
 
 import numpy as np
+from jaxtyping import Float, Int
 
 from trifix.calibration import BoardView, Sighting
 from trifix.geometry.camera import Camera, StereoRig
@@ -27,6 +28,12 @@ def poses(
     return found
 
 
+def bent(cell: Int[np.ndarray, "n 2"], columns: int, rows: int) -> Float[np.ndarray, "n"]:
+    """Height of the points of a dome: 1 in the middle, −1 at the corners."""
+    from_middle = 2 * cell / np.array([columns - 1, rows - 1]) - 1
+    return np.asarray(1 - np.sum(from_middle**2, axis=1))
+
+
 def views(
     T_left_board: list[Pose],
     columns: int,
@@ -36,10 +43,12 @@ def views(
     rng: np.random.Generator,
     board_mm: float = 0.0,
     rig: StereoRig = RIG,
+    bow_mm: float = 0.0,
 ) -> list[BoardView]:
-    """What a rig sees of the points of a board, where it sees them; the points may be out of place."""
+    """What a rig sees of the points of a board, where it sees them; they may be out of place, the board bent."""
     cell = np.stack(np.meshgrid(np.arange(columns), np.arange(rows)), axis=-1).reshape(-1, 2)
     xyz = np.c_[cell * pitch_mm, np.zeros(len(cell))] + board_mm * rng.standard_normal((len(cell), 3))
+    xyz[:, 2] += bow_mm * bent(cell, columns, rows)
     found = []
     for k, T in enumerate(T_left_board):
         both = []

@@ -65,7 +65,7 @@ def test_a_chessboard_gives_back_the_rig(recording: Path, tmp_path: Path, capsys
     assert told["left_out"] == []
     assert 0.01 < float(str(told["rms_px"])) < 0.1
     page = (tmp_path / "out" / "calibration.html").read_text()
-    assert page.count("<svg") == 3
+    assert page.count("<svg") == 3 + bool(told["board_points"])
     assert "http" not in page.replace("http://www.w3.org", "")
 
 
@@ -96,6 +96,7 @@ def test_a_board_that_moved_between_the_exposures_is_named(
         (("--target", "dots", "--rings"), "--target dots needs --pitch-mm."),
         ((*CHESSBOARD, "--rings"), "--rings says that three dots are rings: it goes with --target dots."),
         ((*CHESSBOARD, "--every", "0"), "--every must be at least 1."),
+        ((*CHESSBOARD, "--pitch-sigma", "-0.1"), "--pitch-sigma is -0.1, expected 0 or more."),
     ],
 )
 def test_what_is_missing_is_a_usage_error(arguments: tuple[str, ...], text: str, tmp_path: Path) -> None:
@@ -117,6 +118,8 @@ def test_a_plate_that_fills_the_image_is_calibrated_by_its_rings(
     recording = data / "dice_plate" / "recording"
     told = calibrated(capsys, recording, "-o", tmp_path, "--target", "dots", "--pitch-mm", "3.5", "--rings")
     assert told["both"] == 7
-    assert 0.3 < float(str(told["rms_px"])) < 0.5
+    assert 0.02 < float(str(told["rms_px"])) < 0.04
+    assert 0.004 < float(str(told["board_sigma_mm"])) < 0.009
+    assert (tmp_path / "calibration.html").read_text().count("<svg") == 4
     rig, given = read_rig(tmp_path / "calibration.yaml"), read_rig(recording / "calibration.yaml")
     assert rig.baseline_mm == pytest.approx(given.baseline_mm, rel=0.003)

@@ -8,7 +8,7 @@ import pytest
 from jaxtyping import Float
 from numpy.testing import assert_allclose
 
-from board_views import RIG, poses, views
+from board_views import RIG, bent, poses, views
 from trifix import calibration
 from trifix.calibration import BoardView, Calibration, Sighting, calibrate, parameters_of
 from trifix.errors import CalibrationError
@@ -21,10 +21,10 @@ MIDDLE_MM = (80.0, 50.0)
 
 
 def made(
-    seed: int, count: int = 10, sigma_px: float = 0.1, board_mm: float = 0.0, rig: StereoRig = RIG
+    seed: int, count: int = 10, sigma_px: float = 0.1, board_mm: float = 0.0, rig: StereoRig = RIG, bow_mm: float = 0.0
 ) -> list[BoardView]:
     rng = np.random.default_rng(seed)
-    return views(poses(count, rng, MIDDLE_MM), COLUMNS, ROWS, PITCH_MM, sigma_px, rng, board_mm, rig)
+    return views(poses(count, rng, MIDDLE_MM), COLUMNS, ROWS, PITCH_MM, sigma_px, rng, board_mm, rig, bow_mm)
 
 
 def errors(found: Calibration, rig: StereoRig = RIG) -> Float[np.ndarray, "22"]:
@@ -48,6 +48,37 @@ def test_errors_follow_the_covariance(board_mm: float) -> None:
         assert found.board_sigma_mm == pytest.approx(board_mm, rel=0.25, abs=0.01)
     assert 0.6 < np.mean(nees) < 1.5
     assert 1.0 < max(worst) < 4.5
+
+
+def test_a_bent_board_is_found_to_be_bent() -> None:
+    nees, focal_px = [], []
+    for seed in range(3):
+        seen = made(seed, board_mm=0.02, bow_mm=0.2)
+        found, held = (calibrate(seen, PITCH_MM, SIZE, SIZE, board_sigma_mm=sigma) for sigma in (None, 0.0))
+        nees.append(errors(found) @ np.linalg.solve(found.cov, errors(found)) / 22)
+        focal_px.append([np.abs(errors(each)[[0, 1, 8, 9]]).max() for each in (found, held)])
+        height = found.board_mm[:, 2]
+        expected = 0.2 * bent(found.board_cell, COLUMNS, ROWS)
+        assert np.std(height - expected) < 0.5 * np.std(expected)
+        assert not held.is_board_sought
+        assert found.rms_px < 0.9 * held.rms_px
+    assert 0.6 < np.mean(nees) < 1.5
+    sought_px, held_px = np.mean(focal_px, axis=0)
+    assert sought_px < 0.7 * held_px
+
+
+def test_few_views_hold_the_board() -> None:
+    found = calibrate(made(9, count=4, board_mm=0.2), PITCH_MM, SIZE, SIZE)
+    assert not found.is_board_sought
+    assert found.board_sigma_mm > 0.1
+
+
+def test_the_baseline_is_as_sure_as_the_pitch() -> None:
+    seen = made(10)
+    rough, exact = (calibrate(seen, PITCH_MM, SIZE, SIZE, pitch_sigma=sigma) for sigma in (0.01, 0.0))
+    assert rough.baseline_sigma_mm == pytest.approx(np.hypot(0.01 * RIG.baseline_mm, exact.baseline_sigma_mm), rel=1e-3)
+    assert rough.scale_sigma == pytest.approx(0.01, rel=0.01)
+    assert_allclose(rough.sigma[:16], exact.sigma[:16])
 
 
 def test_without_noise_the_truth_comes_out() -> None:

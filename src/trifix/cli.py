@@ -329,6 +329,8 @@ def calibrate(
     pitch_mm: float | None = None,
     rings: bool = False,
     model: Literal["radtan", "equidistant"] = "radtan",
+    board_sigma_mm: float | None = None,
+    pitch_sigma: float = 1e-4,
     every: int = 1,
     keep_all: bool = False,
     json: Json = False,
@@ -348,6 +350,9 @@ def calibrate(
         rings: Three dots are rings, one at a corner, one in its row and one in its column; the grid may then reach
             beyond the images, and columns and rows need not be told.
         model: Distortion model of both cameras.
+        board_sigma_mm: By how much points of the board may be out of place, per coordinate (mm, one sigma). What the
+            residuals tell, if not given; 0 for a board without errors.
+        pitch_sigma: How well the side or the pitch is known, relative (one sigma).
         every: Look at every so many pairs; for videos.
         keep_all: Give views a say whose residuals stand out.
     """
@@ -367,6 +372,8 @@ def calibrate(
         raise CycloptsError(msg=f"--target {target} needs {' and '.join(missing)}.")
     _refuse_if(rings and target != "dots", "--rings says that three dots are rings: it goes with --target dots.")
     _refuse_if(every < 1, "--every must be at least 1.")
+    for name, sigma in (("--board-sigma-mm", board_sigma_mm or 0.0), ("--pitch-sigma", pitch_sigma)):
+        _refuse_if(not 0.0 <= sigma < float("inf"), f"{name} is {sigma:g}, expected 0 or more.")
     from trifix.boards import Board, find_views
     from trifix.calibration import calibrate as solve
     from trifix.files.images import read_image_pairs
@@ -378,7 +385,10 @@ def calibrate(
     pairs = read_image_pairs(recording)
     with progress_bars("pairs") as show:
         search = find_views(pairs, board, every, lambda done, of: show("looking", done, of))
-    found = solve(search.views, board.pitch_mm, search.left_size_px, search.right_size_px, model, not keep_all)
+    found = solve(
+        search.views, board.pitch_mm, search.left_size_px, search.right_size_px, model, not keep_all, board_sigma_mm,
+        pitch_sigma,
+    )  # fmt: skip
     summary = summarise(found, search, board, recording.resolve().name)
     write_calibration(found, summary, out)
     answer(record_of(summary, out), json, lambda: calibration_table(summary, out))

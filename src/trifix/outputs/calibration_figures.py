@@ -11,6 +11,7 @@ from trifix.geometry.camera import Camera
 from trifix.outputs.figures import BAD, FAINT, GOOD, GRID, INK, PATH, STYLE, svg_of
 
 _MOST_POINTS = 3000  # of one image; more cannot be told apart on a page
+_CELL_ARROW = 0.4  # length of an arrow of the usual deviation of a point of the board, in cells
 _ARROW = 0.03  # length of an arrow of the usual residual, in widths of the image
 
 
@@ -71,6 +72,34 @@ def view_figure(calibration: Calibration) -> str:
         angle = np.linspace(0, 2 * np.pi, 100)
         cloud.plot(*(calibration.rms_px * np.array([np.cos(angle), np.sin(angle)])), color=INK, linewidth=0.8)
         cloud.set(title="All residuals (px) and their rms", xlabel="u", ylabel="v", aspect="equal")
+        return svg_of(figure)
+
+
+def board_figure(calibration: Calibration) -> str:
+    """By how much the board's points are out of place: arrows in its plane, colours out of it; SVG."""
+    cell, off_um = calibration.board_cell, 1e3 * calibration.board_mm
+    usual_um = max(float(np.median(np.linalg.norm(off_um[:, :2], axis=1))), 1e-9)
+    extent = cell.max(axis=0) - cell.min(axis=0) + 1
+    height = float(np.clip(7.0 * extent[1] / extent[0], 2.5, 7.0))
+    with mpl.rc_context(STYLE):  # type: ignore[arg-type]
+        figure = Figure(figsize=(8.5, height + 0.7), layout="constrained")
+        axes = figure.subplots()
+        axes.set_axisbelow(True)
+        most_um = float(np.abs(off_um[:, 2]).max())
+        dots = axes.scatter(
+            cell[:, 0], cell[:, 1], c=off_um[:, 2], cmap="RdBu", vmin=-most_um, vmax=most_um, s=60, linewidth=0
+        )
+        figure.colorbar(dots, ax=axes, label="out of the plane, away from the cameras (µm)")
+        arrows = axes.quiver(
+            *cell.T, *off_um[:, :2].T,
+            color=INK, angles="xy", scale_units="xy", scale=usual_um / _CELL_ARROW, width=0.003, headwidth=4,
+        )  # fmt: skip
+        told_um = float(f"{2 * usual_um:.1g}")
+        axes.quiverkey(arrows, 0.92, 1.03, told_um, f"{told_um:g} µm", labelpos="E")
+        axes.set(title="Points found less points meant", xlabel="column", ylabel="row", aspect="equal")
+        axes.set(
+            xlim=(cell[:, 0].min() - 1.5, cell[:, 0].max() + 1.5), ylim=(cell[:, 1].max() + 1.5, cell[:, 1].min() - 1.5)
+        )
         return svg_of(figure)
 
 

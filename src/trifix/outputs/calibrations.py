@@ -20,7 +20,7 @@ from trifix.files.calibrations import write_rig
 from trifix.files.tables import write_atomically
 from trifix.geometry.camera import Camera
 from trifix.geometry.pose import log_rotation
-from trifix.outputs.calibration_figures import coverage_figure, residual_figure, view_figure
+from trifix.outputs.calibration_figures import board_figure, coverage_figure, residual_figure, view_figure
 from trifix.outputs.page import environment
 from trifix.outputs.summary import versions
 
@@ -36,6 +36,22 @@ class Estimate:
     """The value."""
     sigma: float
     """Its standard deviation."""
+
+
+@dataclass(frozen=True, slots=True)
+class BoardPoint:
+    """By how much a point of the board is out of place, in board coordinates: x along columns, y along rows."""
+
+    column: int
+    """Its column."""
+    row: int
+    """Its row."""
+    x_um: float
+    """Along the columns' count (µm)."""
+    y_um: float
+    """Along the rows' count (µm)."""
+    z_um: float
+    """Out of the board, away from who looks at it (µm)."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -78,6 +94,10 @@ class CalibrationSummary:
     """Of these, what each image does by itself: standard deviation per coordinate (px)."""
     board_sigma_mm: float
     """And what all images have in common: by how much points of the board are out of place, per coordinate (mm)."""
+    scale_sigma: float
+    """Standard deviation of the board's size, relative; part of the covariance."""
+    board_points: tuple[BoardPoint, ...]
+    """By how much its points are out of place; empty where that was not sought."""
     epipolar_rms_px: float
     """Rms distance of points from one another's epipolar lines (px)."""
     coverage: tuple[float, float]
@@ -124,6 +144,12 @@ def summarise(calibration: Calibration, search: Search, board: Board, recording:
         rms_px=calibration.rms_px,
         image_sigma_px=calibration.image_sigma_px,
         board_sigma_mm=calibration.board_sigma_mm,
+        scale_sigma=calibration.scale_sigma,
+        board_points=tuple(
+            BoardPoint(*cell, *place)
+            for cell, place in zip(calibration.board_cell.tolist(), (1e3 * calibration.board_mm).tolist(), strict=True)
+            if calibration.is_board_sought
+        ),
         epipolar_rms_px=calibration.epipolar_rms_px,
         coverage=coverage,
         tilt_deg=float(np.degrees(calibration.tilt_rad)),
@@ -187,6 +213,7 @@ def write_calibration(calibration: Calibration, summary: CalibrationSummary, out
         "coverage": coverage_figure(calibration),
         "residuals": residual_figure(calibration),
         "views": view_figure(calibration),
+        "board": board_figure(calibration) if calibration.is_board_sought else "",
     }
     written = datetime.now().astimezone()
     html = page.render(c=summary, figures=figures, written=written, outlier=OUTLIER, rows=estimate_rows(summary))
@@ -224,7 +251,8 @@ def calibration_table(summary: CalibrationSummary, out: Path) -> Group:
             table.add_row("left out", Text(f"{worst:.3f}", "yellow"), f"px  view {each.view}")
     table.add_row("residual, rms", f"{summary.rms_px:.3f}", f"px  of {summary.points} points")
     table.add_row("of each image", f"{summary.image_sigma_px:.3f}", "px per coordinate")
-    table.add_row("of the board", f"{summary.board_sigma_mm:.4f}", "mm per coordinate: points out of place")
+    sought = ", which the calibration knows" if summary.board_points else ""
+    table.add_row("of the board", f"{summary.board_sigma_mm:.4f}", f"mm per coordinate: points out of place{sought}")
     table.add_row("epipolar, rms", f"{summary.epipolar_rms_px:.3f}", "px")
     table.add_row("baseline", *_in_line(summary.baseline_mm, "mm"))
     for side, camera in (("left", summary.left), ("right", summary.right)):
