@@ -517,9 +517,8 @@ class _Bundle:
                 is_sought[own.target[own.camera == camera]] = False
                 is_free[own.row[own.camera == camera]] = False
                 target, dot = np.flatnonzero(is_sought), np.flatnonzero(is_free)
+                target = target[lens.sees(place[target])]
                 uv = lens.project(place[target])
-                is_inside = ((uv > 0) & (uv < [lens.width_px, lens.height_px])).all(axis=1)
-                target, uv = target[is_inside], uv[is_inside]
                 if not len(target) or not len(dot):
                     continue
                 cov = dots.cov_px2[dot] * self._scale**2

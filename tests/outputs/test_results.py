@@ -348,3 +348,23 @@ def test_after_a_kill_whole_rows_agree_for_every_frame_older_than_a_second(tmp_p
     assert poses_ns[: len(positioned)] == tum_ns[: len(positioned)] == positioned
     read_map(out / "map.csv")
     assert json.loads((out / "summary.json").read_text())["finished"] is False
+
+
+def test_names_of_files_that_are_no_text_are_written_all_the_same(tmp_path: Path):
+    made = list(steps(3))
+    refused = replace(made[1], fix=NoFix(Reason.unreadable_image, "left/\udcff.png cannot be read."))
+    written(tmp_path, "dots", [made[0], refused, made[2]])
+    assert [row["detail"] for row in rows(tmp_path / "frames.csv")][1] == "left/\\udcff.png cannot be read."
+    assert len(rows(tmp_path / "frames.csv")) == 3
+
+
+def test_whatever_goes_wrong_while_files_are_written_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    def fail(self: object, lines: str) -> None:
+        raise ValueError("out of order")
+
+    results = ResultsWriter(tmp_path, "plate", "dots", "", is_online=True)
+    with results:
+        monkeypatch.setattr("trifix.outputs.results._Log.append", fail)
+        results.write(next(steps(1)))
+    with pytest.raises(ValueError, match="out of order"):
+        results.finish()

@@ -83,7 +83,7 @@ class ResultsWriter:
         self._waiting: list[dict[str, list[str]]] = []
         self._is_finished = False
         self._adjusted: Adjusted | NotAdjusted | None = None
-        self._failure: OSError | None = None
+        self._failure: Exception | None = None
         self._lock = threading.Lock()  # held for moments: between the loop, which fills, and the thread, which empties
         self._files = threading.Lock()  # held while files are written or exchanged
         self._folder = out  # where rows go: the results folder, or the hidden one of a second passage
@@ -213,10 +213,12 @@ class ResultsWriter:
             log.close()
 
     def _complain(self) -> None:
-        if self._failure is not None:
+        if isinstance(self._failure, OSError):
             raise RecordingError(
                 f"{self._out}: results cannot be written there ({self._failure.strerror}); what stands there is whole."
             ) from self._failure
+        if self._failure is not None:
+            raise self._failure
 
     def _keep_writing(self) -> None:
         """The thread: everything that is written after the start is written here."""
@@ -232,7 +234,7 @@ class ResultsWriter:
             if self._is_finished:
                 self._publish()
             self._write_state()
-        except OSError as error:
+        except Exception as error:  # whoever writes next is told
             self._failure = error
 
     def _flush(self) -> None:
@@ -337,7 +339,7 @@ class _Log:
         Raises:
             OSError: the disk is full, or worse.
         """
-        block = lines.encode()
+        block = lines.encode(errors="backslashreplace")  # names of files may be no text
         try:
             written = 0
             while written < len(block):
