@@ -620,11 +620,15 @@ class _Bundle:
         return frame if self._out.rig is None or frame.rig is None else replace(frame, rig=self._out.rig)
 
     def _place_the_others(self, xyz_mm: Float[np.ndarray, "k 3"], cov_mm2: Float[np.ndarray, "k 3 3"]) -> None:
-        """Targets that had no say, to where the adjusted poses see them on the average."""
+        """Targets that had no say, to where the adjusted poses see them on the average.
+
+        The poses' errors may be the same in all n frames, and are taken to be: Cov Σ e ≤ n Σ Cov e, however alike.
+        """
         row_of = {i: row for i, row in self._row_of.items() if not self._is_named[row]}
         for row in self._rows[self._out.is_target_adjusted].tolist():
             row_of.pop(int(self._map.id[row]), None)
         W_sum, Wx_sum = np.zeros((len(self._map), 3, 3)), np.zeros((len(self._map), 3))
+        of_points, of_poses, n = np.zeros_like(W_sum), np.zeros_like(W_sum), np.zeros(len(self._map))
         for k, (step, fix) in enumerate(zip(self._placed, self._fixes, strict=True)):
             points = self._points(step)
             if points is None or not self._out.is_frame_adjusted[k]:
@@ -633,13 +637,18 @@ class _Bundle:
             for point, identity in zip(fix.point.tolist(), step.map.id[fix.target].tolist(), strict=True):
                 if identity in row_of:
                     p = points.xyz_mm[point]
-                    J = T.R @ point_jacobian(p[None])[0]
-                    W = np.linalg.inv(T.R @ points.cov_mm2[point] @ T.R.T + J @ P @ J.T)
-                    W_sum[row_of[identity]] += W
-                    Wx_sum[row_of[identity]] += W @ (T.R @ p + T.t_mm)
+                    row, J = row_of[identity], T.R @ point_jacobian(p[None])[0]
+                    of_point, of_pose = T.R @ points.cov_mm2[point] @ T.R.T, J @ P @ J.T
+                    W = np.linalg.inv(of_point + of_pose)
+                    W_sum[row] += W
+                    Wx_sum[row] += W @ (T.R @ p + T.t_mm)
+                    of_points[row] += W @ of_point @ W
+                    of_poses[row] += W @ of_pose @ W
+                    n[row] += 1
         for row in np.flatnonzero(W_sum.any(axis=(1, 2))).tolist():
-            cov_mm2[row] = np.linalg.inv(W_sum[row])
-            xyz_mm[row] = cov_mm2[row] @ Wx_sum[row]
+            C = np.linalg.inv(W_sum[row])
+            cov_mm2[row] = C @ (of_points[row] + n[row] * of_poses[row]) @ C
+            xyz_mm[row] = C @ Wx_sum[row]
 
     def _moved(self, refusal: NoFix) -> NoFix:
         """A refusal whose rival poses are in the world's coordinates."""
