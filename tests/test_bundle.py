@@ -21,6 +21,7 @@ from trifix.records import (
     NoFix,
     PositionedReason,
     ReferenceMap,
+    SensorPoints,
     SingleDots,
     Step,
     StereoDots,
@@ -217,6 +218,31 @@ def test_the_summary_tells_of_smaller_residuals(run: Run) -> None:
         assert 0.5 < told.noise_growth < 1.4
     else:
         assert 0.9 < told.noise_scale < 1.1
+
+
+@pytest.mark.parametrize("run", ["points"], indirect=True)
+@pytest.mark.parametrize(("factor", "believed"), [(5.0, 0.2), (1.2, 1.0)])
+def test_a_stated_noise_holds_unless_the_residuals_contradict_it(run: Run, factor: float, believed: float) -> None:
+    """Stated five times too large, by too few frames for the positioner to have noticed."""
+    vague = [
+        replace(
+            step,
+            frame=replace(
+                step.frame, content=replace(step.frame.content, cov_mm2=step.frame.content.cov_mm2 * factor**2)
+            ),
+            noise_scale=1.0,
+        )
+        for step in run.before
+        if isinstance(step.frame.content, SensorPoints)
+    ]
+    after, _ = adjust_steps(vague, is_noise_stated=True)
+    ids, rows, others = np.intersect1d(after[-1].map.id, run.after[-1].map.id, return_indices=True)
+    sigma, as_it_is = (
+        np.sqrt(np.median(np.trace(map.cov_mm2[at], axis1=1, axis2=2)))
+        for map, at in ((after[-1].map, rows), (run.after[-1].map, others))
+    )
+    assert len(ids) > 20
+    assert 0.85 < sigma / (factor * believed * as_it_is) < 1.15
 
 
 def test_adjusting_again_gives_the_same_bits(run: Run) -> None:

@@ -331,11 +331,11 @@ class _Bundle:
         With variances c·f(g), f = a^(−2g) at apparent size a, the likelihood of n dots is greatest at the growth g of
         least n ln c + Σ ln f, where c = mean(s²/2f) of residuals s (σ at f = 1).
         """
-        out = self._out
-        if is_stated or out.dof <= 0:
+        out, options = self._out, self._config.noise
+        if out.dof < (options.min_samples if is_stated else 1):
             return False
         ratio, growth = self._misfit(), self._growth
-        if self._has_dots:
+        if self._has_dots and not is_stated:
             observations, _ = self._observations(self._seen)
             assert isinstance(observations, DotObservations)
             off = _off(observations, self._seen, self._T, self._xyz, self._rigs_now())
@@ -349,9 +349,12 @@ class _Bundle:
             growth = float(_GROWTHS[best]) if misfit[0] - misfit[best] > _DECISIVE else 0.0
             c = float((s2 / f[growth == _GROWTHS][0]).mean() / (s2 / f[self._growth == _GROWTHS][0]).mean())
             ratio *= float(np.sqrt(c))
-        is_news = growth != self._growth or abs(ratio - 1) > _SAME_NOISE
+        scale = self._scale * ratio
+        if is_stated and options.stated_low <= scale <= options.stated_high:
+            scale = 1.0
+        is_news = growth != self._growth or abs(scale / self._scale - 1) > _SAME_NOISE
         if is_news:
-            self._scale, self._growth = self._scale * ratio, growth
+            self._scale, self._growth = scale, growth
         return is_news
 
     def _misfit(self) -> float:
