@@ -25,6 +25,7 @@ from trifix.files.maps import read_map
 from trifix.files.recordings import read_recording
 from trifix.files.truth import Truth, read_truth
 from trifix.geometry.alignment import align
+from trifix.outputs.figures import style_of
 from trifix.positioner import Positioner
 from trifix.records import Dots, Fix, Frame, ReferenceMap, Step, StereoDots, TargetState
 
@@ -406,7 +407,8 @@ def print_table(title: str, rows: dict[str, Agreement]) -> None:
 
 def drawn(known: dict[str, Agreement], halves: dict[str, Agreement]) -> Figure:
     """Error against predicted sigma, one point a comparison."""
-    with mpl.rc_context({"font.size": 9.5, "axes.spines.top": False, "axes.spines.right": False}):
+    ink, faint, grid = "#1b1f24", "#66707c", "#dde1e6"
+    with mpl.rc_context(style_of(ink, faint, grid)):  # type: ignore[arg-type]
         figure = Figure(figsize=(7, 4.4), layout="constrained")
         axes = figure.subplots()
         ends = np.array([2e-4, 1.0])
@@ -419,9 +421,7 @@ def drawn(known: dict[str, Agreement], halves: dict[str, Agreement]) -> Figure:
             axes.plot(sigma, error, mark, ms=5, mfc=colour, mec="none", label=label)
         axes.set(xscale="log", yscale="log", xlim=ends, ylim=ends)
         axes.set(xlabel="predicted sigma of a length (mm, rms)", ylabel="what came out (mm, rms)")
-        axes.grid(color="#dde1e6", linewidth=0.6)
-        axes.set_axisbelow(True)
-        axes.legend(frameon=False, loc="upper left")
+        axes.legend(loc="upper left")
         return figure
 
 
