@@ -19,6 +19,9 @@ from trifix.records import (
     StereoDots,
 )
 
+MAP_COLUMNS = tuple(name for name in ReferenceMap.__slots__ if name != "joint_mm2")
+"""What a map has for each target; its joint covariance is of all of them."""
+
 LEFT = Camera(1400.0, 1401.0, 646.0, 507.0, 1280, 1024, "radtan", (-0.08, 0.04, 0.0004, -0.0003))
 RIGHT = Camera(1410.0, 1411.0, 634.0, 514.0, 1280, 1024, "radtan", (-0.081, 0.039, -0.0002, 0.0005))
 RIG = StereoRig(LEFT, RIGHT, Pose.exp(np.array([-142.0, 1.0, 24.0, 0.003, 0.33, -0.002])))

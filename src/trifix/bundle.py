@@ -266,12 +266,17 @@ class _Bundle:
     def _with_a_say(self, seen: _Sightings) -> _Sightings:
         """All but the sightings of targets that are neither trusted nor named, in frames that show enough others.
 
-        Who has been seen too seldom to be sure of may be none, but two dots that belong to different targets.
+        Who has been seen too seldom to be sure of may be none, but two dots that belong to different targets. Where the
+        frame that defines the world does not show enough others, all of its own have a say: they tie the rest to it.
         """
         is_trusted = ((self._map.state == TargetState.trusted) | self._is_named)[seen.target]
         each_once = np.unique(np.stack([seen.frame[is_trusted], seen.target[is_trusted]]), axis=1)[0]
         trusted = np.bincount(each_once, minlength=len(self._placed))
-        return seen.of(is_trusted | (trusted[seen.frame] < _HOLDING))
+        has_say = is_trusted | (trusted[seen.frame] < _HOLDING)
+        for first in (k for k, fix in enumerate(self._fixes) if fix.reason is PositionedReason.defines_world):
+            if trusted[first] < _HOLDING:
+                has_say |= np.isin(seen.target, seen.target[seen.frame == first])
+        return seen.of(has_say)
 
     def _observations(self, seen: _Sightings) -> tuple[DotObservations | PointObservations, Int[np.ndarray, "n"]]:
         """What was measured, and the rows of the map that its targets are."""
@@ -417,19 +422,26 @@ class _Bundle:
     def adjust(self, is_noise_stated: bool, watch: Callable[[], None] | None) -> None:
         """Adjusts, with the dots that the adjusted map explains as well, by the noise that the residuals show."""
         options = self._config.adjust
+        before = self._seen, self._scale, self._growth, self._placed
         for k in range(_ROUNDS):
             observations, rows = self._observations(self._seen)
-            out = adjust(
-                observations,
-                self._T,
-                self._xyz[rows],
-                rig=self._rigs if self._has_dots else None,
-                gauge=self._gauge(rows),
-                scale_bars=self._bars(rows),
-                refine_rig=options.rig if options.refines_rig else None,
-                options=options.search,
-                watch=watch,
-            )
+            try:
+                out = adjust(
+                    observations,
+                    self._T,
+                    self._xyz[rows],
+                    rig=self._rigs if self._has_dots else None,
+                    gauge=self._gauge(rows),
+                    scale_bars=self._bars(rows),
+                    refine_rig=options.rig if options.refines_rig else None,
+                    options=options.search,
+                    watch=watch,
+                )
+            except AdjustmentError:
+                if k == 0:
+                    raise
+                self._seen, self._scale, self._growth, self._placed = before  # what was had stands
+                break
             self._out, self._rows = out, rows
             self._T = list(out.T_world_sensor)
             self._xyz = self._xyz.copy()
@@ -437,6 +449,7 @@ class _Bundle:
             self._count += out.steps
             if k == _ROUNDS - 1:
                 break
+            before = self._seen, self._scale, self._growth, [*self._placed]
             is_settled = k == 0 and self._has_dots and self._settle_centres()
             self._is_settled |= is_settled
             more = self._found() if k == 0 and self._has_dots else _Sightings.joined([])

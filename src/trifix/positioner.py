@@ -413,7 +413,11 @@ class Positioner:
             step = self._judge(before.frame, learns=False)
             earlier = placed.get(k, step)
             is_first = isinstance(earlier.fix, Fix) and earlier.fix.reason is PositionedReason.defines_world
-            if isinstance(earlier.fix, Fix) and earlier.points and (is_first or isinstance(step.fix, NoFix)):
+            if (
+                isinstance(earlier.fix, Fix)
+                and earlier.points is not None
+                and (is_first or isinstance(step.fix, NoFix))
+            ):
                 fix = earlier.fix.moved_to(earlier.map, self.map, earlier.points, earlier.centres, earlier.frame.rig)
                 step = replace(earlier, fix=fix, map=self.map, elsewhere=None)
             yield replace(

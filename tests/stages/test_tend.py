@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from constellations import frame_of, noise, points_of, scattered, sensor_covariances
+from constellations import MAP_COLUMNS, frame_of, noise, points_of, scattered, sensor_covariances
 from trifix.errors import ConfigError
 from trifix.geometry.pose import Pose, exp_rotation
 from trifix.records import Event, Fix, Frame, ReferenceMap, SensorPoints, TargetState
@@ -190,9 +190,7 @@ def test_two_targets_that_take_turns_become_the_older_one(places: np.ndarray) ->
     twin = ReferenceMap.given(
         places[[9]] + [0.5, 0.0, 0.0], world.map.cov_mm2[[9]], world.map.view[[9]], np.array([99])
     )
-    world.map = ReferenceMap(
-        *(np.concatenate([getattr(world.map, f), getattr(twin, f)]) for f in ReferenceMap.__slots__)
-    )
+    world.map = ReferenceMap(*(np.concatenate([getattr(world.map, f), getattr(twin, f)]) for f in MAP_COLUMNS))
     for k in range(20, 60):  # the targets are seen now as the one, now as the other
         seen = places.copy()
         seen[9] += [0.5 * (k % 2), 0.0, 0.0]

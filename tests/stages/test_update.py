@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from constellations import (
+    MAP_COLUMNS,
     PARALLEL,
     RIG,
     chi2_limits,
@@ -35,7 +36,7 @@ def spheres(n: int, sigma_mm: float) -> np.ndarray:
 
 
 def columns(map: ReferenceMap) -> dict[str, np.ndarray]:
-    return {name: getattr(map, name) for name in ReferenceMap.__slots__}
+    return {name: getattr(map, name) for name in MAP_COLUMNS}
 
 
 # --- known targets ---------------------------------------------------------------------------------------------------

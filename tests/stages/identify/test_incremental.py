@@ -7,6 +7,7 @@ import hypothesis.strategies as st
 import numpy as np
 from hypothesis import given, settings
 
+from constellations import MAP_COLUMNS
 from trifix.records import ReferenceMap, TargetState
 from trifix.stages.identify import FrequencyTriangles, IdentifyOptions, MinimalTriangles
 from trifix.stages.identify.changes import NearestThree
@@ -89,10 +90,7 @@ class World:
         rows = np.concatenate([vacant, np.arange(len(self.map), len(self.map) + n - len(vacant))])
         new = ReferenceMap.given(self.places(n - len(vacant)), id=np.zeros(n - len(vacant), dtype=np.int64))
         self.map = ReferenceMap(
-            *(
-                np.concatenate([getattr(self.map, name), getattr(new, name)])
-                for name in ReferenceMap.__dataclass_fields__
-            )
+            *(np.concatenate([getattr(self.map, name), getattr(new, name)]) for name in MAP_COLUMNS)
         )
         self.map.xyz_mm[rows] = self.places(n)
         self.map.state[rows] = int(TargetState.provisional)
