@@ -71,7 +71,7 @@ def positioned(frames: Sequence[Frame], true: TrueFrames, config: Config | None 
 
 
 def test_codes_and_hues_are_read_where_the_options_ask_for_them():
-    image = np.full((200, 240, 3), 220, np.uint8)
+    image = np.full((PARALLEL.left.height_px, PARALLEL.left.width_px, 3), 220, np.uint8)
     marker = cv2.aruco.generateImageMarker(cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_5X5_100), 77, 70)
     image[40:110, 30:100] = marker[:, :, None]
     cv2.circle(image, (180, 140), 12, (40, 40, 200), -1, cv2.LINE_AA)

@@ -33,6 +33,7 @@ _CAMERA = 8  # parameters of a camera; six of the pose follow those of both
 _RIG = 2 * _CAMERA + 6
 _SETTLED = 1e-10  # relative decrease of the cost below which the minimum is reached
 _AGREED = 0.02  # relative change of the ratio of both variances below which it is found
+_ROUNDING_PX = 1e-9  # residuals below this are of rounding, and tell nothing of the board
 _UNDAMPED = 1e-9  # share of its curvature, added to a direction, that no longer shortens the step
 
 # OpenCV 4 keeps them in its module for these lenses, OpenCV 5 with all others; their values differ.
@@ -545,7 +546,7 @@ def _seek_board(
     n = observed.printed_mm.size
     freedom = 2 * int(np.count_nonzero(is_kept[observed.view])) - _RIG - 6 * int(np.count_nonzero(is_kept))
     image, board = held.image_sigma_px**2, held.board_sigma_mm**2 if board_sigma_mm is None else board_sigma_mm**2
-    if freedom <= n or not board * image > 0.0:
+    if freedom <= n or not board > 0.0 or not held.image_sigma_px > _ROUNDING_PX:
         return fit, held
     sought = fit
     for _ in range(20):
